@@ -1,0 +1,74 @@
+"""The command line. Commands are imported when they are called, so that help is instant."""
+
+import importlib
+import sys
+from typing import Any
+
+import click
+
+from flowlab import __version__
+from flowlab.errors import FlowlabError
+
+_COMMANDS = {
+    "tasks": ("flowlab.cli.tasks:tasks", "List MetaWorld's 50 tasks."),
+    "extract-sim": ("flowlab.cli.extract_sim:extract_sim", "Make a 3D-flow dataset of simulated demonstrations."),
+    "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
+    "validate": ("flowlab.cli.datasets:validate", "Check a dataset for everything that would spoil training."),
+    "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording or a PNG."),
+    "export": ("flowlab.cli.datasets:export", "Write a dataset in another tool's layout."),
+}
+
+
+class _Commands(click.Group):
+    """A group that imports a command only to run it or to show its own help."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module, _, attribute = _COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
+            from flowlab.errors import unknown
+
+            ctx.fail(str(unknown("command", args[0], _COMMANDS)))
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, about) for name, (_, about) in _COMMANDS.items()])
+
+
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 data invalid; 4 some units failed; 130 interrupted. "
+    "An extraction that ended early, for whatever reason, goes on when the same command is given again.",
+)
+@click.version_option(__version__)
+def cli() -> None:
+    """3D-flow datasets from robot demonstrations, and policies trained on them."""
+
+
+def main(*args: Any) -> None:
+    """Run the command line; every foreseen error is one sentence and an exit code."""
+    try:
+        cli.main(list(args) or None, prog_name="flowlab", standalone_mode=False)
+    except click.exceptions.Exit as end:
+        sys.exit(end.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except FlowlabError as error:
+        click.echo(f"flowlab: {error}", err=True)
+        sys.exit(error.exit_code)
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("\nflowlab: interrupted; what was finished is kept, the same command does the rest", err=True)
+        sys.exit(130)

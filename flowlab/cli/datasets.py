@@ -1,0 +1,90 @@
+"""``flowlab info``, ``flowlab validate`` and ``flowlab export``."""
+
+import json
+from pathlib import Path
+
+import click
+
+from flowlab.cli.console import print_json, print_table
+from flowlab.errors import DataError
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def info(dataset: Path, as_json: bool) -> None:
+    """Say what a dataset holds and how it was made."""
+    from flowlab.cli.reports import folder_size, stage_rows, task_rows
+    from flowlab.storage.dataset import Dataset
+    from flowlab.storage.shard import Shard
+
+    data = Dataset(dataset)
+    tasks, stages = task_rows(data), stage_rows(data)
+    arrays = Shard(dataset / data.refs[0].shard).describe() if data.refs else []
+    about = {
+        "dataset": str(dataset),
+        "recipe": data.manifest.recipe,
+        "flowlab": data.manifest.flowlab,
+        "fingerprint": data.fingerprint,
+        "episodes": len(data),
+        "frames": sum(ref.frames for ref in data.refs),
+        "megabytes": round(folder_size(dataset) / 1e6, 2),
+        "missing": data.missing,
+        "world_frame": data.manifest.world_frame,
+    }
+    if as_json:
+        settings = json.loads(data.manifest.model_dump_json())["settings"]
+        more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats, "settings": settings}
+        print_json({**about, **more})
+        return
+    for name, value in about.items():
+        click.echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
+    print_table(["task", "episodes", "asked for", "frames", "rejected"], [list(t.values()) for t in tasks])
+    print_table(["array", "dimensions", "shape of the first shard", "type", "unit"], [list(a.values()) for a in arrays])
+    limits = [
+        [name, _numbers(a["min"]), _numbers(a["max"]), _numbers(a["mean"]), _numbers(a["std"])]
+        for name, a in data.stats["arrays"].items()
+    ]
+    print_table(["array", "min", "max", "mean", "std"], limits)
+
+
+def _numbers(values: list[float]) -> str:
+    """At most four numbers of a channel list."""
+    return " ".join(f"{v:.3g}" for v in values[:4]) + (" ..." if len(values) > 4 else "")
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def validate(dataset: Path, as_json: bool) -> None:
+    """Check a dataset: one line for each finding, exit code 3 if there is any."""
+    from flowlab.storage.validate import validate as findings_of
+
+    findings = []
+    for finding in findings_of(dataset):
+        findings.append(finding)
+        if not as_json:
+            click.echo(str(finding))
+    if as_json:
+        print_json([{"file": f.place, "problem": f.problem} for f in findings])
+    if findings:
+        raise DataError(f"{dataset}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
+    if not as_json:
+        click.echo(f"{dataset}: sound")
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--to", "layout", type=click.Choice(["dp3"]), required=True, help="The other tool.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Where to write.")
+@click.option("--task", help="Only this task's episodes.")
+def export(dataset: Path, layout: str, out: Path, task: str | None) -> None:
+    """Write a dataset in another tool's layout.
+
+    dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads.
+    """
+    from flowlab.storage.dataset import Dataset
+    from flowlab.storage.export import export_dp3
+
+    count = export_dp3(Dataset(dataset), out, task)
+    click.echo(f"{count} episodes written to {out} for {layout}")

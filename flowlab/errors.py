@@ -1,0 +1,40 @@
+"""Every error a user may meet: one clear sentence, and the exit code it ends the program with."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class FlowlabError(Exception):
+    """Something the user can mend. The message says what was found, what was expected, what to type."""
+
+    exit_code = 1
+
+
+class UsageError(FlowlabError):
+    """A name, an option or a recipe that does not exist or does not fit."""
+
+    exit_code = 2
+
+
+class DataError(FlowlabError):
+    """A dataset on disk that is missing, half written, damaged, or made with other settings."""
+
+    exit_code = 3
+
+
+class UnfinishedError(FlowlabError):
+    """Some work units could not be done; what was done is whole, and the same command does the rest."""
+
+    exit_code = 4
+
+
+class MissingLibraryError(FlowlabError):
+    """An optional library (OpenGL, say) that the chosen settings need and this machine lacks."""
+
+
+def unknown(kind: str, found: str, known: Iterable[str]) -> UsageError:
+    """An error for a name that does not exist: near misses first, else everything that does exist."""
+    names = sorted(known)
+    near = difflib.get_close_matches(found, names, n=3, cutoff=0.6)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names)}"
+    return UsageError(f"no {kind} is called '{found}'; {hint}")

@@ -1,0 +1,1 @@
+"""Cameras, rigid transforms and sampling: pure geometry that knows nothing of robots."""

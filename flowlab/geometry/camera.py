@@ -1,0 +1,66 @@
+"""The pinhole camera, in OpenCV's convention."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Num
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A calibrated pinhole camera without distortion.
+
+    Axes: x right, y down, z forward. The centre of pixel (u, v) lies at integer coordinates (u, v), so
+    an image of width W whose optical axis passes through its middle has ``cx = (W - 1) / 2``.
+    """
+
+    width: int
+    """[px]"""
+    height: int
+    """[px]"""
+    K: Float[np.ndarray, "3 3"]
+    """Intrinsics [px]."""
+    T_world_cam: Float[np.ndarray, "4 4"]
+    """Camera pose: maps camera coordinates to world coordinates [m]."""
+
+    @classmethod
+    def from_fovy(cls, width: int, height: int, fovy_deg: float, T_world_cam: np.ndarray) -> "Camera":
+        """A centred camera with square pixels and the vertical field of view ``fovy_deg``."""
+        f = 0.5 * height / np.tan(np.deg2rad(fovy_deg) / 2)
+        K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
+        return cls(width, height, K, T_world_cam)
+
+    def project(
+        self, xyz_world: Num[np.ndarray, "*batch 3"]
+    ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
+        """Pixel coordinates (u, v) [px] and z-depth [m] of world points; z <= 0 is behind the camera."""
+        R, t = self.T_world_cam[:3, :3], self.T_world_cam[:3, 3]
+        xyz_cam = (xyz_world - t) @ R
+        z = xyz_cam[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            uv = (xyz_cam @ self.K.T)[..., :2] / z[..., None]
+        return uv, z
+
+    def unproject(self, uv: Num[np.ndarray, "*batch 2"], z: Num[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
+        """World points [m] at pixel coordinates (u, v) [px] and z-depth [m]."""
+        u = (uv[..., 0] - self.K[0, 2]) / self.K[0, 0]
+        v = (uv[..., 1] - self.K[1, 2]) / self.K[1, 1]
+        xyz_cam = np.stack([u, v, np.ones_like(u)], -1) * np.asarray(z)[..., None]
+        return xyz_cam @ self.T_world_cam[:3, :3].T + self.T_world_cam[:3, 3]
+
+    def to_json(self) -> dict[str, Any]:
+        """The camera as plain JSON values."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "K": self.K.tolist(),
+            "T_world_cam": self.T_world_cam.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Camera":
+        """The inverse of :meth:`to_json`."""
+        return cls(
+            values["width"], values["height"], np.array(values["K"], float), np.array(values["T_world_cam"], float)
+        )

@@ -1,0 +1,128 @@
+"""The Observer: unproject, crop, sample. There is one, for labelling, training data and evaluation."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numba
+import numpy as np
+from pydantic import Field, model_validator
+
+from flowlab.config import Settings
+from flowlab.errors import DataError
+from flowlab.geometry.sampling import farthest_points
+from flowlab.records import Cloud, Entity, Frame, Observation, Role
+
+Vector3 = tuple[float, float, float]
+
+
+class Box(Settings):
+    """An axis-aligned box in the world frame [m]; points strictly inside are kept."""
+
+    low: Vector3
+    high: Vector3
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> "Box":
+        if any(lo >= hi for lo, hi in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"low {self.low} must be below high {self.high} on every axis")
+        return self
+
+
+class ObserverSettings(Settings):
+    """How a depth picture becomes a point cloud. Stored in every dataset and every checkpoint."""
+
+    points: int = Field(default=1024, gt=0)
+    """Size of the sample."""
+    crop: Box = Box(low=(-0.5, 0.25, -0.2), high=(0.5, 0.97, 0.8))
+    """Workspace. The default holds everything that moves in all 50 MetaWorld tasks, holes included."""
+    crop_of_task: Mapping[str, Box] = {}
+    """Another workspace for single tasks."""
+    drop_background: bool = True
+    """Remove floor, walls and table by what owns the pixel; where owners are unknown the box must do."""
+    padding: Literal["repeat", "zeros"] = "repeat"
+    """What fills the sample when fewer points remain: its own points again, or zeros as DP3 does."""
+
+    def crop_for(self, task: str) -> Box:
+        """The workspace of a task."""
+        return self.crop_of_task.get(task, self.crop)
+
+
+class Observer:
+    """Turns frames of one task into clouds and observations.
+
+    Source of the defaults: 3D FDP crops the static background of one fixed camera and keeps 1024 points
+    by farthest-point sampling.
+    """
+
+    def __init__(self, settings: ObserverSettings, task: str) -> None:
+        self.settings = settings
+        self.task = task
+        crop = settings.crop_for(task)
+        self._low, self._high = np.array(crop.low), np.array(crop.high)
+        self._kept: tuple[tuple[Entity, ...] | None, np.ndarray] = (None, np.ones(1, bool))
+
+    def cloud(self, frame: Frame) -> Cloud:
+        """Every point of the frame inside the crop, in pixel order."""
+        owner = np.full((1, 1), -1, np.int16) if frame.owner is None else frame.owner
+        cam = frame.camera
+        xyz, pixel = _unproject_and_crop(
+            frame.depth, owner, self._kept_owners(frame.entities), cam.K, cam.T_world_cam, self._low, self._high
+        )
+        return Cloud(xyz, pixel, None if frame.owner is None else owner.reshape(-1)[pixel], frame.entities)
+
+    def sample(self, cloud: Cloud) -> Observation:
+        """The farthest-point sample of a cloud."""
+        if len(cloud.xyz_world) == 0:
+            raise DataError(
+                f"{self.task}: no point of the frame lies in the crop {self.settings.crop_for(self.task)}; "
+                "set observer.crop to the workspace of the scene"
+            )
+        index = farthest_points(cloud.xyz_world, self.settings.points)
+        return Observation(pad(cloud.xyz_world[index], self.settings.points, self.settings.padding), len(index))
+
+    def observe(self, frame: Frame) -> Observation:
+        """What a policy sees of a frame."""
+        return self.sample(self.cloud(frame))
+
+    def _kept_owners(self, entities: tuple[Entity, ...]) -> np.ndarray:
+        """Whether to keep a pixel, by owner; the last entry is for owner -1."""
+        if self._kept[0] is not entities:
+            kept = [not self.settings.drop_background or e.role is not Role.BACKGROUND for e in entities]
+            self._kept = (entities, np.array([*kept, True]))
+        return self._kept[1]
+
+
+def pad(xyz: np.ndarray, size: int, padding: str = "repeat") -> np.ndarray:
+    """``xyz`` (k, 3) filled up to (size, 3) by its own points in turn, or by zeros."""
+    if len(xyz) == size:
+        return xyz
+    if padding == "repeat":
+        return xyz[np.arange(size) % len(xyz)]
+    return np.concatenate([xyz, np.zeros((size - len(xyz), 3), xyz.dtype)])
+
+
+@numba.njit(cache=True)
+def _unproject_and_crop(depth, owner, kept, K, T_world_cam, low, high):  # type: ignore[no-untyped-def]
+    """Points of all kept pixels strictly inside the box: xyz (P, 3) float32, pixel (P,) int32."""
+    height, width = depth.shape
+    xyz = np.empty((height * width, 3), np.float32)
+    pixel = np.empty(height * width, np.int32)
+    owned = owner.shape == depth.shape
+    n = 0
+    for v in range(height):
+        y = (v - K[1, 2]) / K[1, 1]
+        for u in range(width):
+            z = np.float64(depth[v, u])
+            if not (z > 0.0) or (owned and not kept[owner[v, u]]):
+                continue
+            x = (u - K[0, 2]) / K[0, 0]
+            inside = True
+            for a in range(3):
+                T = T_world_cam[a]
+                w = (T[0] * x + T[1] * y + T[2]) * z + T[3]
+                inside = inside and low[a] < w and w < high[a]
+                xyz[n, a] = w
+            if inside:
+                pixel[n] = v * width + u
+                n += 1
+    return xyz[:n].copy(), pixel[:n].copy()

@@ -1,0 +1,1 @@
+"""Recipes of typed stages, run unit by unit."""

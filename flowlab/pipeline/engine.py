@@ -1,0 +1,103 @@
+"""Where work units run. The pool on this machine is one engine; a cluster's would be another."""
+
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Protocol, Self
+
+from pebble import ProcessExpired, ProcessPool
+
+from flowlab.errors import FlowlabError
+from flowlab.pipeline.units import WorkUnit
+from flowlab.storage.manifest import Receipt
+
+_SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
+"""A worker is one core's work; these libraries would start threads of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a unit: its receipt, or why there is none."""
+
+    unit: WorkUnit
+    receipt: Receipt | None
+    failure: str = ""
+    """Traceback, or how the worker died."""
+
+
+class Engine(Protocol):
+    """Runs units and hands back outcomes as they come; units never exchange arrays through it."""
+
+    def submit(self, unit: WorkUnit) -> None:
+        """Start a unit as soon as there is room."""
+        ...
+
+    def next_outcome(self) -> Outcome:
+        """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
+        ...
+
+
+class LocalEngine:
+    """A pool of processes on this machine.
+
+    A worker that dies loses its own unit only, which is tried once more in a fresh worker.
+    """
+
+    def __init__(self, work: Callable[[WorkUnit], Receipt], workers: int) -> None:
+        self._work, self._workers = work, workers
+        self._tries: dict[Future[Receipt], tuple[WorkUnit, int]] = {}
+
+    def __enter__(self) -> Self:
+        for name in _SINGLE_THREADED:
+            os.environ.setdefault(name, "1")
+        self._pool = ProcessPool(
+            max_workers=self._workers, context=get_context("spawn"), initializer=_start_worker, initargs=[os.getpid()]
+        )
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._pool.stop()
+        self._pool.join()
+
+    def submit(self, unit: WorkUnit) -> None:
+        """Start a unit as soon as a worker is free."""
+        self._schedule(unit, tries=1)
+
+    def next_outcome(self) -> Outcome:
+        """Wait for a unit to end."""
+        while True:
+            done, _ = wait(self._tries, return_when=FIRST_COMPLETED)
+            future = done.pop()
+            unit, tries = self._tries.pop(future)
+            try:
+                return Outcome(unit, future.result())
+            except ProcessExpired as death:
+                if tries == 1:
+                    self._schedule(unit, tries=2)
+                    continue
+                return Outcome(unit, None, f"its worker died twice (exit code {death.exitcode})")
+            except (FlowlabError, OSError):
+                raise
+            except Exception as error:
+                return Outcome(unit, None, "".join(traceback.format_exception(error)))
+
+    def _schedule(self, unit: WorkUnit, tries: int) -> None:
+        self._tries[self._pool.schedule(self._work, args=[unit])] = unit, tries
+
+
+def _start_worker(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and do not outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

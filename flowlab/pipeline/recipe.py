@@ -1,0 +1,155 @@
+"""Recipes: YAML files that say which stages make a dataset, and with which settings."""
+
+import importlib
+import json
+from collections.abc import Iterable, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import Field, SerializeAsAny, ValidationError, field_validator
+
+from flowlab.config import Settings
+from flowlab.errors import UsageError, unknown
+from flowlab.pipeline.stage import Pipeline, Stage
+from flowlab.pipeline.stages import STAGES
+
+_BY_NAME = {cls.model_fields["stage"].default: cls for cls in STAGES}
+
+
+class Recipe(Settings):
+    """A pipeline, its tasks, and how many episodes of each."""
+
+    name: str
+    description: str = ""
+    tasks: tuple[str, ...] = ()
+    """Tasks or groups of tasks, where the command line names none."""
+    episodes: int = Field(default=10, gt=0)
+    """Accepted episodes per task."""
+    first_seed: int = Field(default=0, ge=0)
+    """Seeds are tried in order from here."""
+    stages: tuple[SerializeAsAny[Stage], ...]
+
+    @field_validator("stages", mode="before")
+    @classmethod
+    def _find_stages(cls, values: Any) -> list[Any]:
+        if not isinstance(values, list | tuple):
+            raise ValueError("must be a list of stages")
+        return [v if isinstance(v, Stage) else _make_stage(v) for v in values]
+
+    def pipeline(self) -> Pipeline:
+        """The stages, joined and checked."""
+        return Pipeline(self.stages)
+
+    def settings(self) -> dict[str, Any]:
+        """Every setting of every stage, by stage name, as JSON values."""
+        values: dict[str, Any] = json.loads(self.model_dump_json())
+        return {s["stage"]: {k: v for k, v in s.items() if k != "stage"} for s in values["stages"]}
+
+
+def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
+    """A recipe by file or by the name of one that comes with flowlab, with ``key.path=value`` overrides."""
+    path = Path(name)
+    if not path.suffix:
+        known = {p.name.removesuffix(".yaml"): p for p in _shipped().iterdir() if p.name.endswith(".yaml")}
+        if name not in known:
+            raise unknown("recipe", name, known)
+        text = known[name].read_text()
+    else:
+        try:
+            text = path.read_text()
+        except OSError as error:
+            raise UsageError(f"{path}: cannot read the recipe ({error.strerror})") from error
+    return parse_recipe(text, str(name), overrides)
+
+
+def parse_recipe(text: str, origin: str, overrides: Iterable[str] = ()) -> Recipe:
+    """A recipe from YAML; ``origin`` is what errors call it."""
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UsageError(f"{origin}: not valid YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise UsageError(f"{origin}: a recipe is a mapping with the keys {', '.join(Recipe.model_fields)}")
+    for override in overrides:
+        _override(values, override)
+    try:
+        recipe = Recipe.model_validate(values)
+    except ValidationError as error:
+        raise UsageError(f"{origin}: {_explain(error, Recipe)}") from error
+    except UsageError as error:
+        raise UsageError(f"{origin}: {error}") from error
+    recipe.pipeline()
+    return recipe
+
+
+def _shipped() -> Any:
+    """Folder of the recipes that come with flowlab: in the package when installed, beside it in a checkout."""
+    installed = files("flowlab") / "pipelines"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "pipelines"
+
+
+def _make_stage(values: Any) -> Stage:
+    if not isinstance(values, Mapping) or not isinstance(values.get("stage"), str):
+        raise UsageError(f"every stage needs a name, as in 'stage: observer'; found {values!r}")
+    name = values["stage"]
+    cls = _import_stage(name) if ":" in name else _BY_NAME.get(name)
+    if cls is None:
+        raise unknown("stage", name, _BY_NAME)
+    try:
+        return cls.model_validate(dict(values))
+    except ValidationError as error:
+        raise UsageError(f"stage '{name}': {_explain(error, cls)}") from error
+
+
+def _import_stage(name: str) -> type[Stage]:
+    module, _, attribute = name.partition(":")
+    try:
+        cls = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"stage '{name}': cannot be imported ({error})") from error
+    if not (isinstance(cls, type) and issubclass(cls, Stage)):
+        raise UsageError(f"stage '{name}': is not a subclass of flowlab.pipeline.stage.Stage")
+    return cls
+
+
+def _override(values: dict[str, Any], text: str) -> None:
+    """Apply ``observer.points=512``: the first part is a stage's name or a key of the recipe."""
+    key, equals, value = text.partition("=")
+    first, *rest = key.split(".")
+    if not equals or not all([first, *rest]):
+        raise UsageError(f"--set {text}: must look like observer.points=512")
+    stages = {s["stage"]: s for s in values.get("stages", []) if isinstance(s, dict) and "stage" in s}
+    known = [*stages, *(k for k in Recipe.model_fields if k != "stages")]
+    if first not in known:
+        raise unknown("stage or key of this recipe", first, known)
+    target, path = (stages[first], rest) if first in stages else (values, [first, *rest])
+    if not path:
+        raise UsageError(f"--set {text}: '{first}' is a stage; name one of its settings")
+    for part in path[:-1]:
+        target = target.setdefault(part, {})
+        if not isinstance(target, dict):
+            raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
+    target[path[-1]] = yaml.safe_load(value)
+
+
+def _explain(error: ValidationError, model: type[Settings]) -> str:
+    """The first thing wrong, by its path, with what exists where a name does not."""
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        known = _fields_at(model, first["loc"][:-1])
+        return f"{where}: {unknown('setting', str(first['loc'][-1]), known)}"
+    return f"{where}: {first['msg']} (found {first['input']!r})"
+
+
+def _fields_at(model: type[Settings], path: tuple[int | str, ...]) -> list[str]:
+    """Names of the settings of the model that a path of field names leads to."""
+    for part in path:
+        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
+        inner = [a for a in (annotation, *getattr(annotation, "__args__", ())) if isinstance(a, type)]
+        models = [a for a in inner if issubclass(a, Settings)]
+        if models:
+            model = models[0]
+    return [name for name in model.model_fields if name != "stage"]

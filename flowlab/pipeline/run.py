@@ -1,0 +1,239 @@
+"""Fill a dataset by a recipe: plan units, run them on an engine, keep the books."""
+
+import errno
+import resource
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+from flowlab.errors import FlowlabError, UnfinishedError
+from flowlab.pipeline.engine import Engine, LocalEngine, Outcome
+from flowlab.pipeline.recipe import Recipe, parse_recipe
+from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected, UnitEpisodes
+from flowlab.pipeline.stages import ExpertStage
+from flowlab.pipeline.units import Share, WorkUnit, next_units
+from flowlab.sim.rollout import Studio
+from flowlab.storage import stats
+from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
+from flowlab.storage.manifest import Manifest, Receipt, Reject, read_receipts
+from flowlab.storage.schema import SCHEMA
+
+_WORLD_FRAMES = {
+    "flowlab": "MetaWorld's own: z up, table top at z = 0 in most tasks, the robot's base at the origin facing +y",
+    "dp3": "DP3's: centred at the camera and turned about 130 degrees about z; robot state stays in MetaWorld's",
+}
+_SECONDS_BETWEEN_SUMMARIES = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a run is: episodes accepted of those wanted, and the receipt that just came in."""
+
+    accepted: int
+    wanted: int
+    rejected: int
+    latest: Receipt | None = None
+
+
+def manifest_for(recipe: Recipe, tasks: tuple[str, ...]) -> Manifest:
+    """The manifest of the dataset a recipe makes."""
+    expert = next((s for s in recipe.stages if isinstance(s, ExpertStage)), None)
+    if expert is None:
+        raise FlowlabError(f"recipe {recipe.name}: extract-sim needs an 'expert' stage at the start")
+    rollout = Studio(tasks[0], expert.scene).record_expert(
+        recipe.first_seed, expert.model_copy(update={"max_steps": 1})
+    )
+    return Manifest(
+        recipe=recipe.name,
+        settings=recipe.settings(),
+        camera=rollout.camera.to_json(),
+        world_frame=_WORLD_FRAMES[expert.scene.convention],
+        first_seed=recipe.first_seed,
+        requested=dict.fromkeys(tasks, recipe.episodes),
+    )
+
+
+def extract(
+    recipe: Recipe,
+    tasks: tuple[str, ...],
+    folder: Path,
+    *,
+    workers: int,
+    share: Share = Share(),
+    report: Callable[[Progress], None] = lambda _: None,
+) -> Dataset:
+    """Fill ``folder`` until every task has its episodes; what an earlier run did is kept.
+
+    Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
+    the dataset is whole in either case.
+    """
+    manifest = begin(folder, manifest_for(recipe, tasks))
+    work = partial(run_unit, recipe.model_dump_json(), manifest.settings_digest, folder)
+    try:
+        with LocalEngine(work, workers) as engine:
+            failures = _run_all(engine, dict.fromkeys(tasks, recipe.episodes), recipe.first_seed, folder, share, report)
+    except OSError as error:
+        raise _storage_error(folder, error) from error
+    finally:
+        summarise(folder)
+    if failures:
+        (folder / "failures.log").write_text("\n\n".join(f"{f.unit.name}\n{f.failure}" for f in failures))
+        last = failures[0].failure.strip().split("\n")[-1]
+        raise UnfinishedError(
+            f"{len(failures)} units failed, the first ({failures[0].unit.name}) with: {last}. "
+            f"All are in {folder / 'failures.log'}; the same command tries them again"
+        )
+    return Dataset(folder)
+
+
+def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int) -> dict[str, Any]:
+    """What :func:`extract` would do, timed on the first seed of the first task; nothing is written."""
+    pipeline = recipe.pipeline()
+    request = EpisodeRequest(task=tasks[0], seed=recipe.first_seed)
+    try:
+        pipeline.run(request)  # compiles and loads
+        start = time.process_time()
+        episode = pipeline.run(request)
+    except Rejected as rejected:
+        stage, reason = rejected.args
+        raise FlowlabError(
+            f"{request.task} seed {request.seed} is rejected at {stage} ({reason}): no estimate"
+        ) from rejected
+    seconds = time.process_time() - start
+    have = {r.task: 0 for r in read_receipts(folder)}
+    for receipt in read_receipts(folder):
+        have[receipt.task] += len(receipt.accepted)
+    todo = sum(max(recipe.episodes - have.get(t, 0), 0) for t in tasks)
+    frame_bytes = sum(v.nbytes for s in SCHEMA if s.per_step and s.name != "depth" and (v := s.of(episode)) is not None)
+    return {
+        "tasks": len(tasks),
+        "episodes_wanted": recipe.episodes * len(tasks),
+        "episodes_to_do": todo,
+        "frames_per_episode": f"{len(episode)} ({request.task} seed {request.seed})",
+        "cpu_s_per_episode": round(seconds, 3),
+        "workers": workers,
+        "estimated_minutes": round(todo * seconds / workers / 60, 2),
+        "estimated_megabytes": round(todo * frame_bytes / 1e6, 1),
+        "out": str(folder),
+    }
+
+
+def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUnit) -> Receipt:
+    """Do a unit: its episodes into its shard, its receipt beside them. Runs in a worker."""
+    pipeline = _pipeline(recipe_json)
+    before = dict(pipeline.tallies)
+    episodes, rejects = [], []
+    for seed in unit.seeds:
+        try:
+            episodes.append(pipeline.run(EpisodeRequest(task=unit.task, seed=seed)))
+        except Rejected as rejected:
+            stage, reason = rejected.args
+            rejects.append(Reject(task=unit.task, seed=seed, stage=stage, reason=reason))
+    digests: tuple[str, ...] = ()
+    if episodes:
+        path = folder / "shards" / f"{unit.name}.zarr"
+        digests = pipeline.write(UnitEpisodes(path, settings_digest, tuple(episodes))).digests
+    receipt = Receipt(
+        unit=unit.name,
+        task=unit.task,
+        seeds=unit.seeds,
+        accepted=tuple(e.seed for e in episodes),
+        frames=tuple(len(e) for e in episodes),
+        digests=digests,
+        rejects=tuple(rejects),
+        stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
+        stats=stats.summarise(episodes) if episodes else {},
+        peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    )
+    keep_receipt(folder, receipt)
+    return receipt
+
+
+@lru_cache(maxsize=1)
+def _pipeline(recipe_json: str) -> Pipeline:
+    return parse_recipe(recipe_json, "recipe").pipeline()
+
+
+def _run_all(
+    engine: Engine,
+    wanted: Mapping[str, int],
+    first_seed: int,
+    folder: Path,
+    share: Share,
+    report: Callable[[Progress], None],
+) -> list[Outcome]:
+    """Submit units and collect outcomes until nothing is left that this run could do."""
+    receipts = _receipts_by_unit(folder)
+    under_way: dict[str, WorkUnit] = {}
+    failures: list[Outcome] = []
+    latest, next_summary = None, time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
+    while True:
+        for unit in _plan(
+            wanted, first_seed, receipts.values(), [*under_way.values(), *(f.unit for f in failures)], share
+        ):
+            under_way[unit.name] = unit
+            engine.submit(unit)
+        report(_progress(wanted, receipts.values(), latest))
+        if not under_way:
+            seen, receipts = receipts.keys(), _receipts_by_unit(folder)
+            if receipts.keys() == seen:  # otherwise jobs beside this one went on: is there more to do now?
+                return failures
+            continue
+        outcome = engine.next_outcome()
+        del under_way[outcome.unit.name]
+        latest = outcome.receipt
+        if outcome.receipt is None:
+            failures.append(outcome)
+        else:
+            receipts[outcome.unit.name] = outcome.receipt
+        if time.monotonic() > next_summary:
+            start = time.monotonic()
+            summarise(folder)
+            next_summary = time.monotonic() + max(_SECONDS_BETWEEN_SUMMARIES, 20 * (time.monotonic() - start))
+
+
+def _plan(
+    wanted: Mapping[str, int], first_seed: int, receipts: Iterable[Receipt], taken: list[WorkUnit], share: Share
+) -> Iterator[WorkUnit]:
+    """The units to submit now. ``taken`` are under way or given up: their seeds are not for anyone else."""
+    tried: dict[str, set[int]] = {task: set() for task in wanted}
+    sure = dict.fromkeys(wanted, 0)
+    for receipt in receipts:
+        if receipt.task in wanted:
+            tried[receipt.task].update(receipt.seeds)
+            sure[receipt.task] += len(receipt.accepted)
+    for unit in taken:
+        tried[unit.task].update(unit.seeds)
+        sure[unit.task] += len(unit.seeds)
+    for task, episodes in wanted.items():
+        yield from next_units(task, episodes, first_seed, tried[task], sure[task], share)
+
+
+def _progress(wanted: Mapping[str, int], receipts: Iterable[Receipt], latest: Receipt | None) -> Progress:
+    accepted, rejected = dict.fromkeys(wanted, 0), 0
+    for receipt in receipts:
+        if receipt.task in wanted:
+            accepted[receipt.task] += len(receipt.accepted)
+            rejected += len(receipt.rejects)
+    return Progress(sum(min(accepted[t], n) for t, n in wanted.items()), sum(wanted.values()), rejected, latest)
+
+
+def _receipts_by_unit(folder: Path) -> dict[str, Receipt]:
+    return {r.unit: r for r in read_receipts(folder)}
+
+
+def _storage_error(folder: Path, error: OSError) -> FlowlabError:
+    """The sentence for a disk that will not take more."""
+    causes = {
+        errno.ENOSPC: "no space is left on its disk; free some",
+        errno.EDQUOT: "your disk quota is used up; free some space",
+        errno.EACCES: "writing is not permitted; change its permissions",
+        errno.EROFS: "it is on a read-only disk; move it",
+    }
+    cause = causes.get(error.errno or 0, f"{error.strerror or error}; see to it")
+    return FlowlabError(
+        f"{folder}: {cause}, then run the same command again: what was finished is kept, and it does the rest"
+    )

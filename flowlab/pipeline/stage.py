@@ -1,0 +1,133 @@
+"""Stages, and how they are joined."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, get_type_hints
+
+from flowlab.config import Settings
+from flowlab.errors import UsageError
+from flowlab.records import Demonstration, Episode
+from flowlab.storage.manifest import StageTally
+
+
+class Rejected(Exception):
+    """Raised by a stage that will not let a record pass; the message is the reason that is kept."""
+
+
+class Stage(Settings):
+    """One step of a pipeline: settings, and a ``process`` from one record to the next.
+
+    A stage of your own is a subclass with an annotated ``process``, put into a recipe by import path
+    (``stage: my_package.my_module:MyStage``). The annotations are what the pipeline checks joins by.
+    """
+
+    stage: str
+    """The stage's name in recipes."""
+    of: ClassVar[type] = object
+    """The kind of demonstration the stage can work on, where not every kind will do."""
+
+    def process(self, record: Any) -> Any:
+        """Turn a record into the next; raise :class:`Rejected` to keep it out of the dataset."""
+        raise NotImplementedError
+
+    @classmethod
+    def takes(cls) -> type:
+        """The type of record the stage works on."""
+        return cls._types()[0]
+
+    @classmethod
+    def gives(cls) -> type:
+        """The type of record the stage makes."""
+        return cls._types()[1]
+
+    @classmethod
+    def _types(cls) -> tuple[type, type]:
+        hints = get_type_hints(cls.process)
+        result = hints.pop("return", None)
+        if len(hints) != 1 or result is None or Any in (result, *hints.values()):
+            raise UsageError(f"stage {cls.__name__}: process must say what it takes and gives: (self, record: A) -> B")
+        return next(iter(hints.values())), result
+
+
+class EpisodeRequest(Settings):
+    """The record every pipeline starts from: make the episode of this task and seed."""
+
+    task: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class UnitEpisodes:
+    """All accepted episodes of one work unit, and where they belong: what the last stage takes."""
+
+    path: Path
+    settings_digest: str
+    episodes: tuple[Episode, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenShard:
+    """What the last stage gives."""
+
+    digests: tuple[str, ...]
+    """SHA-256 of each episode as stored."""
+
+
+class Pipeline:
+    """Stages joined from an :class:`EpisodeRequest` to an :class:`~flowlab.records.Episode`, and a last one
+    that writes the episodes of a unit."""
+
+    def __init__(self, stages: Sequence[Stage]) -> None:
+        self.stages = tuple(stages)
+        self.tallies = {s.stage: StageTally() for s in stages}
+        _check_joins(self.stages)
+
+    def run(self, request: EpisodeRequest) -> Episode:
+        """Make one episode. Raises :class:`Rejected` with the stage's name and its reason as arguments."""
+        record: Any = request
+        for stage in self.stages[:-1]:
+            record = self._process(stage, record)
+        assert isinstance(record, Episode)
+        return record
+
+    def write(self, unit: UnitEpisodes) -> WrittenShard:
+        """Store the episodes of a unit."""
+        written = self._process(self.stages[-1], unit)
+        assert isinstance(written, WrittenShard)
+        return written
+
+    def _process(self, stage: Stage, record: Any) -> Any:
+        start, rejects = time.process_time(), 0
+        try:
+            return stage.process(record)
+        except Rejected as rejected:
+            rejects = 1
+            raise Rejected(stage.stage, str(rejected)) from rejected
+        finally:
+            done = StageTally(calls=1, cpu_s=time.process_time() - start, rejects=rejects)
+            self.tallies[stage.stage] = self.tallies[stage.stage].plus(done)
+
+
+def _check_joins(stages: Sequence[Stage]) -> None:
+    """Refuse stages that do not fit together."""
+    given: type = EpisodeRequest
+    giver, source = "the pipeline's start", None
+    for stage in stages:
+        if given is Episode and stage is stages[-1]:
+            given = UnitEpisodes
+        if not issubclass(given, stage.takes()):
+            raise UsageError(
+                f"stage '{stage.stage}' takes {stage.takes().__name__}, but {giver} gives {given.__name__}"
+            )
+        if source is not None and not issubclass(source, stage.of):
+            raise UsageError(
+                f"stage '{stage.stage}' works on demonstrations of type {stage.of.__name__} only, "
+                f"and these are of type {source.__name__}"
+            )
+        given, giver = stage.gives(), f"stage '{stage.stage}'"
+        if issubclass(given, Demonstration):
+            source = given
+    if not issubclass(given, WrittenShard):
+        raise UsageError(f"the last stage must write the episodes, but {giver} gives {given.__name__}")

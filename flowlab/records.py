@@ -1,0 +1,181 @@
+"""The records that travel between stages: small, frozen, each made in one place.
+
+    Frame -> Cloud -> Observation -> Queries -> Tracks3D -> Episode -> shard
+
+A real recording and a simulated rollout are both a :class:`Demonstration`; they differ only in how
+tracks are made. World coordinates are metres in the dataset's world frame, which ``docs/conventions.md``
+describes; float32 unless said otherwise.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int16, Int32, UInt8
+
+from flowlab.geometry.camera import Camera
+
+
+class Role(IntEnum):
+    """What a surface is to the task."""
+
+    BACKGROUND = 0
+    """Floor, walls, table."""
+    ROBOT = 1
+    OBJECT = 2
+    """Something that can move and is not the robot."""
+    PROP = 3
+    """Something the task is about that cannot move: a hole, a shelf, a hoop."""
+    MARKER = 4
+    """A goal marker: drawn, but made of nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entity:
+    """One thing that can own a pixel."""
+
+    geom: str
+    """Name of the geom, or of the site for a marker; MuJoCo's index where it has no name."""
+    body: str
+    role: Role
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One depth picture of a calibrated camera, with what else is known of its pixels."""
+
+    depth: Float32[np.ndarray, "H W"]
+    """z-depth along the optical axis [m]; 0 where there is no reading."""
+    camera: Camera
+    owner: Int16[np.ndarray, "H W"] | None = None
+    """Index into ``entities`` of what each pixel shows, -1 for nothing; None for a real camera."""
+    entities: tuple[Entity, ...] = ()
+    rgb: UInt8[np.ndarray, "H W 3"] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """All points of one frame that lie in the crop, in pixel order."""
+
+    xyz_world: Float32[np.ndarray, "P 3"]
+    pixel: Int32[np.ndarray, "P"]
+    """Flat index ``v * W + u`` of each point's pixel."""
+    owner: Int16[np.ndarray, "P"] | None = None
+    entities: tuple[Entity, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a policy sees of the scene at one instant."""
+
+    points_world: Float32[np.ndarray, "N 3"]
+    """Farthest-point sample of the cloud, in that order: the first k are its sample of k."""
+    count: int
+    """How many of the points are distinct; the rest repeat them (or are zero, in the DP3 profile)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Queries:
+    """The points to follow, on the first frame."""
+
+    xyz_world: Float32[np.ndarray, "M 3"]
+    owner: Int16[np.ndarray, "M"]
+    """Index into ``entities``; -1 where the owner is not known."""
+    count: int
+    """How many are distinct; the rest repeat them."""
+    entities: tuple[Entity, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks3D:
+    """Where every query point is at every instant."""
+
+    xyz_world: Float32[np.ndarray, "T M 3"]
+    """Absolute positions; flow is derived on load: ``flow[t] = xyz[t + 1] - xyz[t]``."""
+    visible: Bool[np.ndarray, "T M"]
+    association_distance: Float32[np.ndarray, "M"]
+    """How far from its query the followed point lies at the first frame [m]; 0 for exact tracks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demonstration(ABC):
+    """A demonstration one can look at: a simulated rollout, or a recording of a real robot."""
+
+    task: str
+    seed: int
+    camera: Camera
+    state: Float32[np.ndarray, "T S"]
+    action: Float32[np.ndarray, "T A"]
+    """The action taken after the observation of the same row, as executed."""
+    success: Bool[np.ndarray, "T"]
+    """Whether the task counts as solved after the action of the same row."""
+    object_pose: Float32[np.ndarray, "T 9"] | None = None
+    """Position [m] and 6D rotation of the manipulated body, where it is known."""
+    extras: Mapping[str, Any] = field(default_factory=dict)
+    """Small JSON values of where it comes from, such as MetaWorld's ``rand_vec``."""
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @abstractmethod
+    def frame(self, t: int) -> Frame:
+        """The picture taken at step ``t``, before action ``t``."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedDemo:
+    """A demonstration, and what the Observer saw of it."""
+
+    demo: Demonstration
+    points_world: Float32[np.ndarray, "T N 3"]
+    point_count: Int32[np.ndarray, "T"]
+    first_cloud: Cloud
+    depth: Float32[np.ndarray, "T H W"]
+    owner: Int16[np.ndarray, "T H W"] | None = None
+    rgb: UInt8[np.ndarray, "T H W 3"] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class QueriedDemo:
+    """An observed demonstration, and the points to follow through it."""
+
+    observed: ObservedDemo
+    queries: Queries
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One labelled demonstration, as it is stored. Row t of every array is the same instant; fields that a
+    :class:`Demonstration` has too mean the same."""
+
+    task: str
+    seed: int
+    camera: Camera
+    point_cloud: Float32[np.ndarray, "T N 3"]
+    point_count: Int32[np.ndarray, "T"]
+    state: Float32[np.ndarray, "T S"]
+    action: Float32[np.ndarray, "T A"]
+    success: Bool[np.ndarray, "T"]
+    queries: Queries
+    tracks: Tracks3D
+    object_pose: Float32[np.ndarray, "T 9"] | None = None
+    depth: Float32[np.ndarray, "T H W"] | None = None
+    rgb: UInt8[np.ndarray, "T H W 3"] | None = None
+    extras: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def flow(self) -> Float[np.ndarray, "T M 3"]:
+        """Displacement [m] of every query point during action t; zero for the last row."""
+        return np.diff(self.tracks.xyz_world, axis=0, append=self.tracks.xyz_world[-1:])
+
+    @property
+    def query_role(self) -> Int[np.ndarray, "M"]:
+        """The :class:`Role` of every query's owner, -1 where it is not known."""
+        roles = np.array([e.role for e in self.queries.entities] + [-1])
+        return roles[self.queries.owner]

@@ -1,0 +1,62 @@
+"""Pictures by MuJoCo's own OpenGL renderer: the second opinion on depth, and the only source of colour."""
+
+import os
+
+import numpy as np
+
+from flowlab.errors import MissingLibraryError
+from flowlab.geometry.camera import Camera
+from flowlab.records import Frame
+from flowlab.sim.environment import SceneSettings
+from flowlab.sim.scene import Poses, Scene
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before mujoco is imported the first time
+
+import mujoco
+
+_INSTALL = (
+    "OpenGL cannot be used here ({reason}); install it with 'apt-get install libegl1 libgl1-mesa-dri' "
+    "(or set MUJOCO_GL=osmesa after 'apt-get install libosmesa6'), or use --renderer zbuffer, which needs none"
+)
+
+
+class GLRenderer:
+    """Renders a scene with OpenGL from recorded poses; slow, and the same at every episode."""
+
+    def __init__(self, scene: Scene, camera: Camera, settings: SceneSettings) -> None:
+        self.scene, self.camera, self._settings = scene, camera, settings
+        self._data = mujoco.MjData(scene.model)
+        mujoco.mj_forward(scene.model, self._data)
+        self._options = mujoco.MjvOption()
+        if not settings.markers:
+            self._options.sitegroup[:] = 0
+        try:
+            self._renderer = mujoco.Renderer(scene.model, camera.height, camera.width)
+        except Exception as error:  # every back end fails in its own way
+            raise MissingLibraryError(_INSTALL.format(reason=error)) from error
+
+    def frame(self, poses: Poses) -> Frame:
+        """Depth, owners and, if asked for, colour of the scene with everything at the given poses."""
+        d = self._data
+        d.geom_xpos[:], d.geom_xmat[:] = poses.geom_pos, poses.geom_mat
+        d.site_xpos[:], d.site_xmat[:] = poses.site_pos, poses.site_mat
+        self._renderer.update_scene(d, self._settings.camera.name, self._options)
+        self._hide_bodies()
+        self._renderer.enable_depth_rendering()
+        depth = self._renderer.render().copy()
+        self._renderer.disable_depth_rendering()
+        self._renderer.enable_segmentation_rendering()
+        number, kind = np.moveaxis(self._renderer.render(), -1, 0)
+        self._renderer.disable_segmentation_rendering()
+        owner = np.full(number.shape, -1, np.int16)
+        is_geom, is_site = kind == mujoco.mjtObj.mjOBJ_GEOM, kind == mujoco.mjtObj.mjOBJ_SITE
+        owner[is_geom], owner[is_site] = number[is_geom], number[is_site] + self.scene.model.ngeom
+        depth[owner < 0] = 0
+        rgb = self._renderer.render().copy() if self._settings.rgb else None
+        return Frame(depth, self.camera, owner, self.scene.entities, rgb)
+
+    def _hide_bodies(self) -> None:
+        body_of, hidden = self.scene.model.geom_bodyid, self.scene.hidden_bodies
+        for shown in self._renderer.scene.geoms[: self._renderer.scene.ngeom]:
+            if shown.objtype == mujoco.mjtObj.mjOBJ_GEOM and body_of[shown.objid] in hidden:
+                shown.rgba[3] = 0

@@ -1,0 +1,1 @@
+"""Datasets on disk. The only package that knows zarr."""

@@ -1,0 +1,135 @@
+"""A dataset: a folder with a manifest, receipts and shards, open to reading at any moment of its making."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from flowlab.errors import DataError
+from flowlab.records import Episode
+from flowlab.storage import stats
+from flowlab.storage.card import dataset_card
+from flowlab.storage.files import write_json, write_whole
+from flowlab.storage.manifest import MANIFEST, Manifest, Receipt, differences, read_receipts
+from flowlab.storage.shard import Shard, remove_leftovers
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRef:
+    """Where an episode lies in a dataset."""
+
+    task: str
+    seed: int
+    frames: int
+    shard: str
+    """Path below the dataset."""
+    position: int
+    """Index within the shard."""
+
+
+class Dataset:
+    """A dataset opened for reading: episodes in order of task and seed."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        if not self.path.exists():
+            raise DataError(f"{self.path}: there is no such folder")
+        self.manifest = Manifest.read(self.path)
+        self.receipts = read_receipts(self.path)
+
+    def __len__(self) -> int:
+        return len(self.refs)
+
+    @cached_property
+    def refs(self) -> list[EpisodeRef]:
+        """All episodes that count: those with a receipt."""
+        return sorted(
+            (
+                EpisodeRef(r.task, seed, frames, r.shard, k)
+                for r in self.receipts
+                for k, (seed, frames) in enumerate(zip(r.accepted, r.frames, strict=True))
+            ),
+            key=lambda ref: (ref.task, ref.seed),
+        )
+
+    def episode(self, index: int) -> Episode:
+        """The episode at a position of :attr:`refs`."""
+        if not 0 <= index < len(self):
+            raise DataError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
+        ref = self.refs[index]
+        return Shard(self.path / ref.shard).episode(ref.position)
+
+    def episodes(self) -> Iterator[Episode]:
+        """All episodes, shard by shard."""
+        for receipt in self.receipts:
+            if receipt.accepted:
+                yield from Shard(self.path / receipt.shard).episodes()
+
+    @cached_property
+    def stats(self) -> dict[str, Any]:
+        """Limits, mean and deviation of every array, and how much moves."""
+        return stats.describe(stats.merge(dict(r.stats) for r in self.receipts if r.accepted))
+
+    @property
+    def fingerprint(self) -> str:
+        """Identifies settings and content, however they are spread over shards; a checkpoint names the data it
+        was trained on by it."""
+        episodes = [(r.task, *x) for r in self.receipts for x in zip(r.accepted, r.digests, strict=True)]
+        content = [self.manifest.settings_digest, *(f"{t} {seed} {digest}" for t, seed, digest in sorted(episodes))]
+        return hashlib.sha256("\n".join(content).encode()).hexdigest()[:16]
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Episodes still to be made, by task; empty when the dataset is complete."""
+        have: dict[str, int] = {}
+        for r in self.receipts:
+            have[r.task] = have.get(r.task, 0) + len(r.accepted)
+        return {t: n - have.get(t, 0) for t, n in self.manifest.requested.items() if have.get(t, 0) < n}
+
+
+def begin(folder: Path, manifest: Manifest) -> Manifest:
+    """Make a dataset folder, or check that an existing one was made with the same settings.
+
+    Returns the manifest now on disk, which asks for the episodes of both. Raises :class:`DataError` with
+    the differing settings.
+    """
+    try:
+        (folder / "shards").mkdir(parents=True, exist_ok=True)
+        (folder / "receipts").mkdir(exist_ok=True)
+    except (PermissionError, NotADirectoryError, FileExistsError) as error:
+        raise DataError(f"{folder}: cannot make a dataset here ({error.strerror}); choose another --out") from error
+    if (folder / MANIFEST).exists():
+        old = Manifest.read(folder)
+        # Through JSON, so that tuples and lists compare as they are stored.
+        mine = json.loads(manifest.model_dump_json())
+        theirs = json.loads(old.model_dump_json())
+        compared = ("settings", "first_seed", "camera")
+        lines = list(differences({k: theirs[k] for k in compared}, {k: mine[k] for k in compared}))
+        if lines:
+            raise DataError(
+                f"{folder}: made with other settings, and one dataset has one setting. "
+                f"Choose another --out, or the same settings:\n  " + "\n  ".join(lines)
+            )
+        requested = {t: max(n, manifest.requested.get(t, 0)) for t, n in old.requested.items()}
+        manifest = old.model_copy(update={"requested": {**manifest.requested, **requested}})
+    write_json(folder / MANIFEST, json.loads(manifest.model_dump_json()))
+    remove_leftovers(folder / "shards")
+    return manifest
+
+
+def keep_receipt(folder: Path, receipt: Receipt) -> None:
+    """Write a unit's receipt: from now on its shard counts."""
+    write_json(folder / "receipts" / f"{receipt.unit}.json", json.loads(receipt.model_dump_json()))
+
+
+def summarise(folder: Path) -> Dataset:
+    """Write what follows from the receipts: statistics, rejects and the dataset card."""
+    dataset = Dataset(folder)
+    write_json(folder / "stats.json", dataset.stats)
+    rejects = [x.model_dump_json() + "\n" for r in dataset.receipts for x in r.rejects]
+    write_whole(folder / "rejects.jsonl", "".join(rejects))
+    write_whole(folder / "README.md", dataset_card(dataset.manifest, dataset.receipts, dataset.stats))
+    return dataset

@@ -1,0 +1,214 @@
+"""One shard: a zarr v3 group of whole episodes, there under its name only when complete."""
+
+import hashlib
+import os
+import shutil
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.storage import MemoryStore
+
+from flowlab.errors import DataError
+from flowlab.geometry.camera import Camera
+from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
+from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION, ArraySpec
+
+STEPS_PER_CHUNK = 256
+"""A chunk holds at most this many rows; most episodes are one chunk per array."""
+
+
+def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str, *, depth: bool = False) -> None:
+    """Write episodes to ``path``, replacing what a run that left no receipt may have put there.
+
+    The shard is made in memory, written to a temporary folder beside its place, and renamed: whatever
+    ends the process, ``path`` is either absent or whole. Chunks carry a CRC-32C checksum.
+    """
+    files = _encode(episodes, settings_digest, depth)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{_temporary_prefix()}{os.getpid()}-{path.name}")
+    try:
+        for name, content in files.items():
+            file = temporary / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+        if path.exists():
+            shutil.rmtree(path, ignore_errors=True)
+        os.rename(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def episode_digest(episode: Episode, *, depth: bool = False) -> str:
+    """SHA-256 of everything stored of an episode, whatever shard it lies in."""
+    digest = hashlib.sha256(f"{episode.task} {episode.camera.to_json()} {dict(episode.extras)}".encode())
+    for spec in SCHEMA:
+        values = None if spec.name == "depth" and not depth else spec.of(episode)
+        if values is not None:
+            digest.update(f"{spec.path} {values.shape}".encode() + np.ascontiguousarray(values, spec.dtype).tobytes())
+    return digest.hexdigest()
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete temporary shards of processes of this machine that no longer run."""
+    for leftover in folder.glob(f"{_temporary_prefix()}*"):
+        pid = int(leftover.name.removeprefix(_temporary_prefix()).partition("-")[0])
+        if not _runs(pid):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+class Shard:
+    """A shard opened for reading."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self.group = zarr.open_group(path, mode="r", zarr_format=3)
+        except (FileNotFoundError, ValueError, KeyError) as error:
+            raise DataError(f"{path}: not a readable zarr v3 group ({_first_line(error)}); {_REDO}") from error
+        self.attributes: Mapping[str, Any] = self.group.attrs.asdict()
+
+    def __len__(self) -> int:
+        return len(self.attributes["episodes"])
+
+    def array(self, spec_path: str) -> np.ndarray:
+        """A whole array; a missing or damaged chunk is an error, never silent zeros."""
+        place = f"{self.path}/{spec_path}"
+        try:
+            array = self.group[spec_path]
+            assert isinstance(array, zarr.Array)
+            if array.nchunks_initialized != array.nchunks:
+                raise DataError(
+                    f"{place}: {array.nchunks - array.nchunks_initialized} of {array.nchunks} chunks missing; {_REDO}"
+                )
+            return np.asarray(array[...])
+        except KeyError as error:
+            raise DataError(f"{place}: the array is missing; {_REDO}") from error
+        except (ValueError, RuntimeError, OSError) as error:
+            raise DataError(f"{place}: damaged ({_first_line(error)}); {_REDO}") from error
+
+    def has(self, spec: ArraySpec) -> bool:
+        """Whether the shard holds an array."""
+        return spec.path in self.group
+
+    def describe(self) -> list[dict[str, Any]]:
+        """Name, dimensions, shape, type and unit of every array."""
+        paths = [*(s.path for s in SCHEMA if self.has(s)), EPISODE_ENDS]
+        arrays = {p: a for p in paths if isinstance(a := self.group[p], zarr.Array)}
+        return [
+            {
+                "array": path,
+                "dimensions": ", ".join(map(str, getattr(a.metadata, "dimension_names", None) or ())),
+                "shape": " x ".join(map(str, a.shape)),
+                "type": str(a.dtype),
+                "unit": a.attrs.get("unit", ""),
+            }
+            for path, a in arrays.items()
+        ]
+
+    def rows(self) -> list[slice]:
+        """The rows of each episode in the ``data`` arrays."""
+        ends = self.array(EPISODE_ENDS).tolist()
+        return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+    def episodes(self) -> Iterator[Episode]:
+        """Every episode of the shard."""
+        columns = {s.path: self.array(s.path) for s in SCHEMA if self.has(s) or not s.optional}
+        for k, rows in enumerate(self.rows()):
+            yield self._episode(k, {p: a[rows] if p.startswith("data/") else a[k] for p, a in columns.items()})
+
+    def episode(self, k: int) -> Episode:
+        """The k-th episode; reads only its chunks."""
+        rows = self.rows()[k]
+        columns = {}
+        for spec in SCHEMA:
+            if self.has(spec) or not spec.optional:
+                columns[spec.path] = self.array(spec.path)[rows if spec.per_step else k]
+        return self._episode(k, columns)
+
+    def _episode(self, k: int, columns: Mapping[str, np.ndarray]) -> Episode:
+        about = self.attributes["episodes"][k]
+        entities = tuple(Entity(g, b, Role[r.upper()]) for g, b, r in self.attributes["entities"])
+        return Episode(
+            task=about["task"],
+            seed=int(columns["meta/seed"]),
+            camera=Camera.from_json(self.attributes["camera"]),
+            point_cloud=columns["data/point_cloud"],
+            point_count=columns["data/point_count"],
+            state=columns["data/state"],
+            action=columns["data/action"],
+            success=columns["data/success"],
+            queries=Queries(
+                columns["meta/query_xyz"], columns["meta/query_owner"], int(columns["meta/query_count"]), entities
+            ),
+            tracks=Tracks3D(columns["data/tracks"], columns["data/visible"], columns["meta/association_distance"]),
+            object_pose=columns.get("data/object_pose"),
+            depth=columns.get("data/depth"),
+            rgb=columns.get("data/rgb"),
+            extras=about["extras"],
+        )
+
+
+_REDO = "delete the unit's receipt and run the same extract command again to make it anew"
+
+
+def _encode(episodes: Sequence[Episode], settings_digest: str, depth: bool) -> dict[str, bytes]:
+    """The files of a shard, by relative path."""
+    first = episodes[0]
+    if any(e.camera.to_json() != first.camera.to_json() for e in episodes):
+        raise DataError("the episodes of one shard must share one camera")
+    store: dict[str, Any] = {}
+    group = zarr.create_group(
+        MemoryStore(store),
+        zarr_format=3,
+        attributes={
+            "flowlab_schema": SCHEMA_VERSION,
+            "settings_digest": settings_digest,
+            "camera": first.camera.to_json(),
+            "entities": [[e.geom, e.body, e.role.name.lower()] for e in first.queries.entities],
+            "episodes": [{"task": e.task, "extras": dict(e.extras)} for e in episodes],
+        },
+    )
+    for spec in SCHEMA:
+        if spec.name == "depth" and not depth:
+            continue
+        parts = [part for e in episodes if (part := spec.of(e)) is not None]
+        if parts:
+            _write(group, spec.path, np.concatenate(parts).astype(spec.dtype), spec.dims, spec.unit, spec.meaning)
+    ends = np.cumsum([len(e) for e in episodes], dtype=np.int64)
+    _write(group, EPISODE_ENDS, ends, ("episode",), "1", "the row after each episode's last")
+    return {name: content.to_bytes() for name, content in store.items()}
+
+
+def _write(group: zarr.Group, path: str, values: np.ndarray, dims: tuple[str, ...], unit: str, meaning: str) -> None:
+    group.create_array(
+        path,
+        data=values,
+        chunks=(max(1, min(len(values), STEPS_PER_CHUNK)), *(max(1, n) for n in values.shape[1:])),
+        compressors=[ZstdCodec(level=1), Crc32cCodec()],
+        dimension_names=dims,
+        attributes={"unit": unit, "meaning": meaning},
+        config={"write_empty_chunks": True},  # so that a missing chunk always means damage
+    )
+
+
+def _temporary_prefix() -> str:
+    return f".tmp-{socket.gethostname()}-"
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().split("\n")[0] or type(error).__name__
