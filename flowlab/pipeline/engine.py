@@ -17,8 +17,14 @@ from flowlab.errors import FlowlabError
 from flowlab.pipeline.units import WorkUnit
 from flowlab.storage.manifest import Receipt
 
-_SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
-"""A worker is one core's work; these libraries would start threads of their own."""
+_WORKER_ENVIRONMENT = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "LP_NUM_THREADS",
+    "MALLOC_ARENA_MAX",
+)
+"""All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +60,7 @@ class LocalEngine:
         self._tries: dict[Future[Receipt], tuple[WorkUnit, int]] = {}
 
     def __enter__(self) -> Self:
-        for name in _SINGLE_THREADED:
+        for name in _WORKER_ENVIRONMENT:
             os.environ.setdefault(name, "1")
         self._pool = ProcessPool(
             max_workers=self._workers, context=get_context("spawn"), initializer=_start_worker, initargs=[os.getpid()]

@@ -12,7 +12,7 @@ from typing import Any
 from flowlab.errors import FlowlabError, UnfinishedError
 from flowlab.pipeline.engine import Engine, LocalEngine, Outcome
 from flowlab.pipeline.recipe import Recipe, parse_recipe
-from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected, UnitEpisodes
+from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected
 from flowlab.pipeline.stages import ExpertStage
 from flowlab.pipeline.units import Share, WorkUnit, next_units
 from flowlab.sim.rollout import Studio
@@ -20,6 +20,7 @@ from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
 from flowlab.storage.manifest import Manifest, Receipt, Reject, read_receipts
 from flowlab.storage.schema import SCHEMA
+from flowlab.storage.shard import episode_digest
 
 _WORLD_FRAMES = {
     "flowlab": "MetaWorld's own: z up, table top at z = 0 in most tasks, the robot's base at the origin facing +y",
@@ -107,7 +108,7 @@ def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int)
     for receipt in read_receipts(folder):
         have[receipt.task] += len(receipt.accepted)
     todo = sum(max(recipe.episodes - have.get(t, 0), 0) for t in tasks)
-    frame_bytes = sum(v.nbytes for s in SCHEMA if s.per_step and s.name != "depth" and (v := s.of(episode)) is not None)
+    frame_bytes = sum(v.nbytes for s in SCHEMA if s.per_step and (v := s.of(episode)) is not None)
     return {
         "tasks": len(tasks),
         "episodes_wanted": recipe.episodes * len(tasks),
@@ -132,17 +133,15 @@ def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUni
         except Rejected as rejected:
             stage, reason = rejected.args
             rejects.append(Reject(task=unit.task, seed=seed, stage=stage, reason=reason))
-    digests: tuple[str, ...] = ()
     if episodes:
-        path = folder / "shards" / f"{unit.name}.zarr"
-        digests = pipeline.write(UnitEpisodes(path, settings_digest, tuple(episodes))).digests
+        pipeline.store(folder / "shards" / f"{unit.name}.zarr", episodes, settings_digest)
     receipt = Receipt(
         unit=unit.name,
         task=unit.task,
         seeds=unit.seeds,
         accepted=tuple(e.seed for e in episodes),
         frames=tuple(len(e) for e in episodes),
-        digests=digests,
+        digests=tuple(episode_digest(e) for e in episodes),
         rejects=tuple(rejects),
         stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
         stats=stats.summarise(episodes) if episodes else {},

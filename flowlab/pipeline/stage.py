@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
@@ -58,45 +57,43 @@ class EpisodeRequest(Settings):
     seed: int
 
 
-@dataclass(frozen=True, slots=True)
-class UnitEpisodes:
-    """All accepted episodes of one work unit, and where they belong: what the last stage takes."""
+class Writer(Stage):
+    """The last stage: takes the episodes of a work unit one by one, then stores them together."""
 
-    path: Path
-    settings_digest: str
-    episodes: tuple[Episode, ...]
+    def process(self, record: Episode) -> Episode:
+        """What is to be stored of an episode; the rest of it need not stay in memory."""
+        raise NotImplementedError
 
-
-@dataclass(frozen=True, slots=True)
-class WrittenShard:
-    """What the last stage gives."""
-
-    digests: tuple[str, ...]
-    """SHA-256 of each episode as stored."""
+    def store(self, path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
+        """Write the episodes of a unit to ``path``, which must be either absent or whole at any moment."""
+        raise NotImplementedError
 
 
 class Pipeline:
     """Stages joined from an :class:`EpisodeRequest` to an :class:`~flowlab.records.Episode`, and a last one
-    that writes the episodes of a unit."""
+    that stores episodes."""
 
     def __init__(self, stages: Sequence[Stage]) -> None:
         self.stages = tuple(stages)
         self.tallies = {s.stage: StageTally() for s in stages}
         _check_joins(self.stages)
+        last = self.stages[-1]
+        assert isinstance(last, Writer)
+        self.writer = last
 
     def run(self, request: EpisodeRequest) -> Episode:
         """Make one episode. Raises :class:`Rejected` with the stage's name and its reason as arguments."""
         record: Any = request
-        for stage in self.stages[:-1]:
+        for stage in self.stages:
             record = self._process(stage, record)
         assert isinstance(record, Episode)
         return record
 
-    def write(self, unit: UnitEpisodes) -> WrittenShard:
+    def store(self, path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
         """Store the episodes of a unit."""
-        written = self._process(self.stages[-1], unit)
-        assert isinstance(written, WrittenShard)
-        return written
+        start = time.process_time()
+        self.writer.store(path, episodes, settings_digest)
+        self._count(self.writer, StageTally(cpu_s=time.process_time() - start))
 
     def _process(self, stage: Stage, record: Any) -> Any:
         start, rejects = time.process_time(), 0
@@ -106,8 +103,10 @@ class Pipeline:
             rejects = 1
             raise Rejected(stage.stage, str(rejected)) from rejected
         finally:
-            done = StageTally(calls=1, cpu_s=time.process_time() - start, rejects=rejects)
-            self.tallies[stage.stage] = self.tallies[stage.stage].plus(done)
+            self._count(stage, StageTally(calls=1, cpu_s=time.process_time() - start, rejects=rejects))
+
+    def _count(self, stage: Stage, done: StageTally) -> None:
+        self.tallies[stage.stage] = self.tallies[stage.stage].plus(done)
 
 
 def _check_joins(stages: Sequence[Stage]) -> None:
@@ -115,8 +114,6 @@ def _check_joins(stages: Sequence[Stage]) -> None:
     given: type = EpisodeRequest
     giver, source = "the pipeline's start", None
     for stage in stages:
-        if given is Episode and stage is stages[-1]:
-            given = UnitEpisodes
         if not issubclass(given, stage.takes()):
             raise UsageError(
                 f"stage '{stage.stage}' takes {stage.takes().__name__}, but {giver} gives {given.__name__}"
@@ -129,5 +126,5 @@ def _check_joins(stages: Sequence[Stage]) -> None:
         given, giver = stage.gives(), f"stage '{stage.stage}'"
         if issubclass(given, Demonstration):
             source = given
-    if not issubclass(given, WrittenShard):
-        raise UsageError(f"the last stage must write the episodes, but {giver} gives {given.__name__}")
+    if not (stages and isinstance(stages[-1], Writer)):
+        raise UsageError(f"the last stage must store the episodes, as 'write' does, but the last is {giver}")

@@ -1,6 +1,8 @@
 """The stages that come with flowlab. Each is a thin skin over the function that does the work."""
 
-from functools import lru_cache
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -9,12 +11,13 @@ from pydantic import Field
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, sample_queries
-from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage, UnitEpisodes, WrittenShard
+from flowlab.pipeline.memory import return_freed_memory
+from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage, Writer
 from flowlab.records import Demonstration, Episode, ObservedDemo, QueriedDemo
 from flowlab.sim.environment import SceneSettings
 from flowlab.sim.rollout import ExpertSettings, Rollout, Studio
 from flowlab.sim.tracks import RigidFlowSettings, label
-from flowlab.storage.shard import episode_digest, write_shard
+from flowlab.storage.shard import write_shard
 
 
 class ExpertStage(Stage, ExpertSettings):
@@ -28,13 +31,16 @@ class ExpertStage(Stage, ExpertSettings):
         return self.studio(record.task).record_expert(record.seed, self)
 
     def studio(self, task: str) -> Studio:
-        """The simulation of a task, kept between episodes."""
-        return _studio(task, self.scene)
+        """The simulation of a task; the last one used is kept, since units come task by task."""
+        key = task, self.scene
+        if key not in _last_studio:
+            _last_studio.clear()
+            return_freed_memory()
+            _last_studio[key] = Studio(*key)
+        return _last_studio[key]
 
 
-@lru_cache(maxsize=1)  # each further one costs some 25 MB, and units come task by task
-def _studio(task: str, scene: SceneSettings) -> Studio:
-    return Studio(task, scene)
+_last_studio: dict[tuple[str, SceneSettings], Studio] = {}
 
 
 class ObserverStage(Stage, ObserverSettings):
@@ -45,23 +51,25 @@ class ObserverStage(Stage, ObserverSettings):
     def process(self, record: Demonstration) -> ObservedDemo:
         """Unproject, crop and sample every frame."""
         observer = Observer(self, record.task)
-        frames = [record.frame(t) for t in range(len(record))]
-        first_cloud = observer.cloud(frames[0])
-        try:
-            seen = [observer.observe(f) for f in frames]
-        except DataError as error:
-            raise Rejected(str(error)) from error
-        owners = [f.owner for f in frames if f.owner is not None]
-        colours = [f.rgb for f in frames if f.rgb is not None]
-        return ObservedDemo(
-            record,
-            np.stack([o.points_world for o in seen]),
-            np.array([o.count for o in seen], np.int32),
-            first_cloud,
-            np.stack([f.depth for f in frames]),
-            np.stack(owners) if owners else None,
-            np.stack(colours) if colours else None,
-        )
+        first = record.frame(0)
+        steps, shape = len(record), first.depth.shape
+        points = np.empty((steps, self.points, 3), np.float32)
+        count = np.empty(steps, np.int32)
+        depth = np.empty((steps, *shape), np.float32)
+        owner = None if first.owner is None else np.empty((steps, *shape), np.int16)
+        rgb = None if first.rgb is None else np.empty((steps, *shape, 3), np.uint8)
+        for t in range(steps):
+            frame = first if t == 0 else record.frame(t)
+            try:
+                seen = observer.observe(frame)
+            except DataError as error:
+                raise Rejected(f"step {t}: {error}") from error
+            points[t], count[t], depth[t] = seen.points_world, seen.count, frame.depth
+            if owner is not None:
+                owner[t] = frame.owner
+            if rgb is not None:
+                rgb[t] = frame.rgb
+        return ObservedDemo(record, points, count, observer.cloud(first), depth, owner, rgb)
 
 
 class QueriesStage(Stage, QuerySettings):
@@ -122,17 +130,20 @@ class AcceptStage(Stage):
         return record
 
 
-class WriteStage(Stage):
+class WriteStage(Writer):
     """Writes the episodes of a unit into its shard."""
 
     stage: Literal["write"] = "write"
     depth: bool = False
     """Store the depth pictures too, so that clouds can be cropped anew later."""
 
-    def process(self, record: UnitEpisodes) -> WrittenShard:
+    def process(self, record: Episode) -> Episode:
+        """The episode without what is not stored."""
+        return record if self.depth else replace(record, depth=None)
+
+    def store(self, path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
         """Write the shard in one step."""
-        write_shard(record.path, record.episodes, record.settings_digest, depth=self.depth)
-        return WrittenShard(tuple(episode_digest(e, depth=self.depth) for e in record.episodes))
+        write_shard(path, episodes, settings_digest)
 
 
 STAGES: tuple[type[Stage], ...] = (

@@ -4,7 +4,6 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import cKDTree
 
@@ -118,6 +117,8 @@ def _nearest_vertices(
 
 def _vertices(scene: Scene, poses: Poses, entity: int) -> np.ndarray:
     """Mesh vertices (V, 3) of a geom or site in MuJoCo's world; primitives as trimesh makes them."""
+    import trimesh  # here, because only the nearest-vertex variants need its 23 MB
+
     m = scene.model
     if entity < m.ngeom:
         kind, size = m.geom_type[entity], m.geom_size[entity]

@@ -22,13 +22,13 @@ STEPS_PER_CHUNK = 256
 """A chunk holds at most this many rows; most episodes are one chunk per array."""
 
 
-def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str, *, depth: bool = False) -> None:
+def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
     """Write episodes to ``path``, replacing what a run that left no receipt may have put there.
 
     The shard is made in memory, written to a temporary folder beside its place, and renamed: whatever
     ends the process, ``path`` is either absent or whole. Chunks carry a CRC-32C checksum.
     """
-    files = _encode(episodes, settings_digest, depth)
+    files = _encode(episodes, settings_digest)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{_temporary_prefix()}{os.getpid()}-{path.name}")
     try:
@@ -43,11 +43,11 @@ def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str, *
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def episode_digest(episode: Episode, *, depth: bool = False) -> str:
+def episode_digest(episode: Episode) -> str:
     """SHA-256 of everything stored of an episode, whatever shard it lies in."""
     digest = hashlib.sha256(f"{episode.task} {episode.camera.to_json()} {dict(episode.extras)}".encode())
     for spec in SCHEMA:
-        values = None if spec.name == "depth" and not depth else spec.of(episode)
+        values = spec.of(episode)
         if values is not None:
             digest.update(f"{spec.path} {values.shape}".encode() + np.ascontiguousarray(values, spec.dtype).tobytes())
     return digest.hexdigest()
@@ -156,7 +156,7 @@ class Shard:
 _REDO = "delete the unit's receipt and run the same extract command again to make it anew"
 
 
-def _encode(episodes: Sequence[Episode], settings_digest: str, depth: bool) -> dict[str, bytes]:
+def _encode(episodes: Sequence[Episode], settings_digest: str) -> dict[str, bytes]:
     """The files of a shard, by relative path."""
     first = episodes[0]
     if any(e.camera.to_json() != first.camera.to_json() for e in episodes):
@@ -174,8 +174,6 @@ def _encode(episodes: Sequence[Episode], settings_digest: str, depth: bool) -> d
         },
     )
     for spec in SCHEMA:
-        if spec.name == "depth" and not depth:
-            continue
         parts = [part for e in episodes if (part := spec.of(e)) is not None]
         if parts:
             _write(group, spec.path, np.concatenate(parts).astype(spec.dtype), spec.dims, spec.unit, spec.meaning)
