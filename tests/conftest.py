@@ -1,0 +1,41 @@
+"""What tests share: one real rollout and one small dataset, each made once."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flowlab.pipeline.recipe import load_recipe
+from flowlab.pipeline.stage import EpisodeRequest
+from flowlab.records import Episode
+
+Cli = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def flowlab() -> Cli:
+    """Runs the command line as a user does, in a process of its own."""
+
+    def run(*args: str | Path, timeout: float = 240, **options: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "flowlab", *map(str, args)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, **options)  # type: ignore[call-overload,no-any-return]
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def hammer_episode() -> Episode:
+    """A real episode with its depth pictures, straight from the pipeline."""
+    pipeline = load_recipe("metaworld", ["write.depth=true"]).pipeline()
+    return pipeline.run(EpisodeRequest(task="hammer", seed=0))
+
+
+@pytest.fixture(scope="session")
+def small_dataset(tmp_path_factory: pytest.TempPathFactory, flowlab: Cli) -> Path:
+    """Two tasks, three episodes each, made through the command line. Copy it before changing it."""
+    folder = tmp_path_factory.mktemp("data") / "small"
+    result = flowlab("extract-sim", "drawer-open", "push-back", "--episodes", 3, "--out", folder, "--workers", 2)
+    assert result.returncode == 0, result.stderr
+    return folder
