@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from flowlab.cli.console import ProgressBar, console, print_json
-from flowlab.errors import UsageError
+from flowlab.errors import MissingLibraryError, UsageError
 
 if TYPE_CHECKING:
     from flowlab.pipeline.recipe import Recipe
@@ -51,8 +51,17 @@ def extract_sim(
     does the rest.
     """
     sys.path.insert(0, os.getcwd())  # a recipe's own stages may lie beside it
-    from flowlab.pipeline.recipe import load_recipe
-    from flowlab.pipeline.run import Progress, extract
+    try:
+        from flowlab.pipeline.recipe import load_recipe
+        from flowlab.pipeline.run import Progress, extract
+    except Exception as error:
+        if "MUJOCO_GL" not in os.environ:
+            raise
+        # MuJoCo loads the back end it is told of on import, needed or not.
+        raise MissingLibraryError(
+            f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
+            "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
+        ) from error
     from flowlab.pipeline.units import Share
     from flowlab.sim.tasks import GROUPS, select_tasks
 

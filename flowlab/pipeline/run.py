@@ -4,6 +4,7 @@ import errno
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -76,10 +77,13 @@ def extract(
     try:
         with LocalEngine(work, workers) as engine:
             failures = _run_all(engine, dict.fromkeys(tasks, recipe.episodes), recipe.first_seed, folder, share, report)
+        dataset = summarise(folder)
     except OSError as error:
         raise _storage_error(folder, error) from error
-    finally:
-        summarise(folder)
+    except BaseException:
+        with suppress(OSError):  # what ended the run is what the user must hear of
+            summarise(folder)
+        raise
     if failures:
         (folder / "failures.log").write_text("\n\n".join(f"{f.unit.name}\n{f.failure}" for f in failures))
         last = failures[0].failure.strip().split("\n")[-1]
@@ -87,7 +91,7 @@ def extract(
             f"{len(failures)} units failed, the first ({failures[0].unit.name}) with: {last}. "
             f"All are in {folder / 'failures.log'}; the same command tries them again"
         )
-    return Dataset(folder)
+    return dataset
 
 
 def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int) -> dict[str, Any]:

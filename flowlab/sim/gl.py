@@ -1,7 +1,10 @@
 """Pictures by MuJoCo's own OpenGL renderer: the second opinion on depth, and the only source of colour."""
 
+import importlib
 import os
+import weakref
 
+import mujoco
 import numpy as np
 
 from flowlab.errors import MissingLibraryError
@@ -10,10 +13,6 @@ from flowlab.records import Frame
 from flowlab.sim.environment import SceneSettings
 from flowlab.sim.scene import Poses, Scene
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before mujoco is imported the first time
-
-import mujoco
-
 _INSTALL = (
     "OpenGL cannot be used here ({reason}); install it with 'apt-get install libegl1 libgl1-mesa-dri' "
     "(or set MUJOCO_GL=osmesa after 'apt-get install libosmesa6'), or use --renderer zbuffer, which needs none"
@@ -21,7 +20,7 @@ _INSTALL = (
 
 
 class GLRenderer:
-    """Renders a scene with OpenGL from recorded poses; slow, and the same at every episode."""
+    """Renders a scene with OpenGL from recorded poses; one serves all episodes of its scene."""
 
     def __init__(self, scene: Scene, camera: Camera, settings: SceneSettings) -> None:
         self.scene, self.camera, self._settings = scene, camera, settings
@@ -30,10 +29,10 @@ class GLRenderer:
         self._options = mujoco.MjvOption()
         if not settings.markers:
             self._options.sitegroup[:] = 0
-        try:
-            self._renderer = mujoco.Renderer(scene.model, camera.height, camera.width)
-        except Exception as error:  # every back end fails in its own way
-            raise MissingLibraryError(_INSTALL.format(reason=error)) from error
+        _choose_context()
+        self._renderer = mujoco.Renderer(scene.model, camera.height, camera.width)
+        # At exit the context must go before the libraries it needs.
+        self.close = weakref.finalize(self, self._renderer.close)
 
     def frame(self, poses: Poses) -> Frame:
         """Depth, owners and, if asked for, colour of the scene with everything at the given poses."""
@@ -60,3 +59,18 @@ class GLRenderer:
         for shown in self._renderer.scene.geoms[: self._renderer.scene.ngeom]:
             if shown.objtype == mujoco.mjtObj.mjOBJ_GEOM and body_of[shown.objid] in hidden:
                 shown.rgba[3] = 0
+
+
+def _choose_context() -> None:
+    """Make MuJoCo use the back end of MUJOCO_GL, or EGL, which works without a display.
+
+    MuJoCo itself chooses when it is first imported, and then a window system; too early, and the wrong one
+    for a machine without a screen.
+    """
+    backend = os.environ.get("MUJOCO_GL") or "egl"
+    try:
+        context = importlib.import_module(f"mujoco.{backend}").GLContext
+        context(1, 1).free()
+    except Exception as error:  # every back end fails in its own way
+        raise MissingLibraryError(_INSTALL.format(reason=f"{backend}: {error}")) from error
+    mujoco.gl_context.GLContext = context

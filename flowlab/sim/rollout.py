@@ -60,16 +60,19 @@ class Studio:
         if settings.rgb and settings.renderer != "gl":
             raise FlowlabError("colour pictures need OpenGL; add --renderer gl (expert.scene.renderer=gl)")
         self.simulation = Simulation(task, settings)
-        self._packed = PackedScene(self.simulation.scene) if settings.renderer == "zbuffer" else None
+        self._packed = PackedScene(self.simulation.scene)
+        self._gl: Renderer | None = None
 
     def renderer(self, first: Poses) -> Renderer:
         """A renderer for the episode whose first poses are given."""
         sim = self.simulation
-        if self._packed is not None:
+        if sim.settings.renderer == "zbuffer":
             return ZBuffer(sim.scene, sim.camera(), first, self._packed)
-        from flowlab.sim.gl import GLRenderer
+        if self._gl is None:
+            from flowlab.sim.gl import GLRenderer  # only here is OpenGL looked for
 
-        return GLRenderer(sim.scene, sim.camera(), sim.settings)
+            self._gl = GLRenderer(sim.scene, sim.camera(), sim.settings)
+        return self._gl
 
     def record_expert(self, seed: int, settings: ExpertSettings) -> Rollout:
         """Let the expert solve the layout of ``seed``, or try to until ``max_steps``."""

@@ -20,7 +20,7 @@ def write_whole(path: Path, text: str) -> None:
 
 def write_json(path: Path, values: Any) -> None:
     """Replace a JSON file in one step; the same values give the same bytes."""
-    write_whole(path, json.dumps(values, indent=1, sort_keys=True) + "\n")
+    write_whole(path, json.dumps(values, indent=1) + "\n")
 
 
 def read_json(path: Path) -> Any:
