@@ -1,0 +1,58 @@
+"""The colours that recordings and stills share: one per role, loud for tracks and quiet for clouds."""
+
+import numpy as np
+from jaxtyping import Int, UInt8
+from scipy.spatial import cKDTree
+
+from flowlab.records import Episode, Role
+
+UNKNOWN = -1
+"""Stands for the role of a point whose owner is not known."""
+ROLE_RGB = {
+    Role.BACKGROUND: (138, 143, 152),
+    Role.ROBOT: (62, 134, 214),
+    Role.OBJECT: (240, 134, 50),
+    Role.PROP: (70, 172, 120),
+    Role.MARKER: (214, 78, 140),
+    UNKNOWN: (163, 130, 200),
+}
+"""sRGB of each role; told apart by people who confuse red with green, too."""
+SERIES_RGB = [
+    (94, 160, 230), (245, 156, 80), (108, 196, 150), (230, 112, 162), (178, 150, 218), (222, 200, 90),
+    (110, 205, 215), (226, 112, 98), (170, 178, 188),
+]  # fmt: skip
+"""Lines of one plot, in turn."""
+SUCCESS_RGB = (255, 255, 255)
+_PALETTE = np.array([ROLE_RGB[role] for role in (*Role, UNKNOWN)], np.uint8)  # so that -1 finds the last
+_CLOUD_GREY = np.array([150, 154, 160])
+
+
+def role_rgb(role: Int[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:
+    """The colour of each role."""
+    colours: np.ndarray = _PALETTE[role]
+    return colours
+
+
+def cloud_rgb(role: Int[np.ndarray, "*batch"], tint: float = 0.35) -> UInt8[np.ndarray, "*batch 3"]:
+    """Grey with a share ``tint`` of the role's colour; plain grey where the role is not known."""
+    known = (role != UNKNOWN)[..., None]
+    return np.where(known, (1 - tint) * _CLOUD_GREY + tint * role_rgb(role), _CLOUD_GREY).astype(np.uint8)
+
+
+def cloud_role(episode: Episode, t: int) -> Int[np.ndarray, "P"]:
+    """A guess at the role of every distinct cloud point of step t, for tinting: that of the nearest track
+    point. Unknown where none is near, as where only the object is tracked."""
+    points = episode.point_cloud[t, : episode.point_count[t]]
+    count = episode.queries.count
+    marks = episode.tracks.xyz_world[t, :count]
+    if len(points) == 0 or count < 2:
+        return np.full(len(points), UNKNOWN)
+    distance, nearest = cKDTree(marks).query(points)
+    return np.where(distance <= _reach(episode), episode.query_role[:count][nearest], UNKNOWN)
+
+
+def _reach(episode: Episode) -> float:
+    """How far around it [m] a track point speaks for the cloud: twice the spacing of the query points."""
+    xyz_world = episode.queries.xyz_world[: episode.queries.count]
+    spacing = cKDTree(xyz_world).query(xyz_world, k=[2])[0]
+    return 2 * float(np.median(spacing))

@@ -1,0 +1,73 @@
+"""How a recording opens in the viewer: which views there are, what they show, and from where."""
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float
+
+from flowlab.records import Episode
+
+CAMERA = "/world/camera/main"
+DEPTH = f"{CAMERA}/depth"
+RGB = f"{CAMERA}/rgb"
+
+
+def layout(episode: Episode) -> rrb.Blueprint:
+    """The scene large, pictures and facts and plots beside it."""
+    pictures = [
+        rrb.Spatial2DView(origin=CAMERA, contents=[f"+ {entity}"], name=name)
+        for entity, name, there in [(RGB, "rgb", episode.rgb), (DEPTH, "depth", episode.depth)]
+        if there is not None
+    ]
+    info = rrb.TextDocumentView(origin="/info", name="info")
+    plots = [
+        _plot("state", ["+ /scalars/state/**"], legend=episode.state.shape[1] <= 6),
+        _plot("action and success", ["+ /scalars/action/**", "+ /scalars/success"], legend=True),
+    ]
+    # A depth picture under a pinhole would be unprojected into the scene, over the cloud.
+    contents = ["+ /world/**", f"- {DEPTH}/**", f"- {RGB}/**"]
+    floor = rr.components.Plane3D([0, 0, 1], _box_world(episode)[0][2])
+    scene = rrb.Spatial3DView(
+        contents=contents,
+        name="scene",
+        eye_controls=_eye(episode),
+        background=[18, 20, 24],
+        line_grid=rrb.LineGrid3D(plane=floor, spacing=0.1, color=[52, 56, 62]),
+    )
+    side = rrb.Vertical(rrb.Tabs(*pictures, info), *plots, row_shares=[4, 3, 3])
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, side, column_shares=[7, 3]),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=20, play_state="playing", loop_mode="all"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _plot(name: str, contents: list[str], *, legend: bool) -> rrb.TimeSeriesView:
+    box = rrb.PlotLegend(rrb.Corner2D.RightBottom, visible=legend)
+    return rrb.TimeSeriesView(origin="/scalars", contents=contents, name=name, plot_legend=box)
+
+
+def _eye(episode: Episode) -> rrb.EyeControls3D:
+    """Looks at the scene from 30 degrees above, from a little beside the camera, so that that shows too."""
+    low, high = _box_world(episode)
+    centre = (low + high) / 2
+    towards = episode.camera.T_world_cam[:3, 3] - centre
+    azimuth, elevation = np.arctan2(towards[1], towards[0]) + 0.6, np.deg2rad(30)
+    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    position = centre + size(episode) * np.array(direction)
+    return rrb.EyeControls3D(position=position, look_target=centre, eye_up=[0, 0, 1])
+
+
+def size(episode: Episode) -> float:
+    """Length [m] of the scene's box, which dots, lines and axes are scaled by."""
+    low, high = _box_world(episode)
+    return float(np.linalg.norm(high - low))
+
+
+def _box_world(episode: Episode) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """The corners [m] of a box around the tracks and nearly all of the first cloud."""
+    cloud = episode.point_cloud[0, : episode.point_count[0]]
+    tracks = episode.tracks.xyz_world[:, : episode.queries.count].reshape(-1, 3)
+    bounds = np.concatenate([np.percentile(cloud, [2, 98], axis=0), tracks])
+    return bounds.min(0), bounds.max(0)

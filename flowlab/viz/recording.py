@@ -1,0 +1,147 @@
+"""An episode as a Rerun recording, with a layout that opens well."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from jaxtyping import Bool, UInt8
+
+from flowlab.geometry.transforms import rotation_from_6d
+from flowlab.records import Episode
+from flowlab.viz.colours import SERIES_RGB, SUCCESS_RGB, cloud_rgb, cloud_role, role_rgb
+from flowlab.viz.facts import STEP_S, describe
+from flowlab.viz.layout import CAMERA, DEPTH, RGB, layout, size
+
+TRAIL_STEPS = 20
+"""A trail shows where a point was over this many steps."""
+_STILL = 1e-3
+"""A point that moves less than this over a whole trail [m] gets none."""
+_HIDDEN_LIGHT = 0.4
+"""Brightness of what the camera does not see, against 1 for what it sees."""
+
+
+def write_recording(episode: Episode, path: Path, *, name: str, about: str = "") -> None:
+    """Write a ``.rrd`` that opens in any Rerun viewer. ``path`` is either absent, as before, or whole.
+
+    ``name`` is what the viewer calls the recording; ``about`` is Markdown put above the facts in its info panel.
+    All positions are metres in the world frame of the episode.
+    """
+    recording = rr.RecordingStream("flowlab")
+    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with _strict():
+            recording.save(temporary, default_blueprint=layout(episode))
+            recording.send_recording_name(name)
+            for send in (_send_cloud, _send_tracks, _send_camera, _send_pictures, _send_object, _send_scalars):
+                send(recording, episode)
+            _send_info(recording, f"{about}\n\n{describe(episode)}")
+            recording.disconnect()  # writes what is buffered, and the footer
+        os.replace(temporary, path)
+    finally:
+        recording.disconnect()
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _strict() -> Iterator[None]:
+    """Makes Rerun raise what it otherwise warns of, leaving data out."""
+    before = rr.strict_mode()
+    rr.set_strict_mode(True)
+    try:
+        yield
+    finally:
+        rr.set_strict_mode(before)
+
+
+def _times(episode: Episode) -> list[rr.TimeColumn]:
+    steps = np.arange(len(episode))
+    return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps * STEP_S)]
+
+
+def _send_info(recording: rr.RecordingStream, text: str) -> None:
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    recording.log("/info", rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
+    steps = range(len(episode))
+    points = [episode.point_cloud[t, : episode.point_count[t]] for t in steps]
+    colours = [cloud_rgb(cloud_role(episode, t)) for t in steps]
+    columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colours))
+    recording.send_columns("/world/cloud", _times(episode), columns.partition([len(p) for p in points]))
+    recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * size(episode)), static=True)
+
+
+def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
+    T, M = len(episode), episode.queries.count
+    xyz_world = episode.tracks.xyz_world[:, :M]
+    rgb = _shaded(role_rgb(episode.query_role[:M]), episode.tracks.visible[:, :M])
+    columns = rr.Points3D.columns(positions=xyz_world.reshape(-1, 3), colors=rgb.reshape(-1, 3))
+    recording.send_columns("/world/tracks/points", _times(episode), columns.partition([M] * T))
+    recording.log("/world/tracks/points", rr.Points3D.from_fields(radii=0.005 * size(episode)), static=True)
+
+    windows = [xyz_world[max(0, t - TRAIL_STEPS) : t + 1] for t in range(T)]
+    moved = np.array([np.linalg.norm(np.ptp(w, axis=0), axis=-1) > _STILL for w in windows])
+    strips = [w[:, k] for w, moving in zip(windows, moved, strict=True) for k in np.flatnonzero(moving)]
+    lines = rr.LineStrips3D.columns(strips=strips, colors=rgb[moved])
+    recording.send_columns("/world/tracks/trails", _times(episode), lines.partition(moved.sum(1)))
+    recording.log("/world/tracks/trails", rr.LineStrips3D.from_fields(radii=0.0012 * size(episode)), static=True)
+
+
+def _shaded(rgb: UInt8[np.ndarray, "M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
+    """The colours at every step, darker where the camera does not see the point."""
+    return (rgb * np.where(visible, 1.0, _HIDDEN_LIGHT)[..., None]).astype(np.uint8)
+
+
+def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
+    camera, T_world_cam = episode.camera, episode.camera.T_world_cam
+    recording.log(CAMERA, rr.Transform3D(translation=T_world_cam[:3, 3], mat3x3=T_world_cam[:3, :3]), static=True)
+    pinhole = rr.Pinhole(
+        image_from_camera=camera.K,
+        resolution=[camera.width, camera.height],
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.1 * size(episode),
+    )
+    recording.log(CAMERA, pinhole, static=True)
+
+
+def _send_pictures(recording: rr.RecordingStream, episode: Episode) -> None:
+    T, resolution = len(episode), {"width": episode.camera.width, "height": episode.camera.height}
+    if episode.depth is not None:
+        depth_mm = np.clip(episode.depth * 1000 + 0.5, 0, 65535).astype(np.uint16)  # half the size of float32
+        known = depth_mm[depth_mm > 0]
+        limits = [0, np.percentile(known, 95) if len(known) else 1]
+        form = rr.components.ImageFormat(**resolution, channel_datatype=rr.ChannelDatatype.U16)
+        style = rr.DepthImage.from_fields(format=form, meter=1000.0, depth_range=limits, colormap="viridis")
+        recording.log(DEPTH, style, static=True)
+        buffers = depth_mm.reshape(T, -1).view(np.uint8)
+        recording.send_columns(DEPTH, _times(episode), rr.DepthImage.columns(buffer=buffers))
+    if episode.rgb is not None:
+        form = rr.components.ImageFormat(**resolution, color_model="RGB", channel_datatype=rr.ChannelDatatype.U8)
+        recording.log(RGB, rr.Image.from_fields(format=form), static=True)
+        recording.send_columns(RGB, _times(episode), rr.Image.columns(buffer=episode.rgb.reshape(T, -1)))
+
+
+def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
+    if episode.object_pose is None:
+        return
+    R_world_object = rotation_from_6d(episode.object_pose[:, 3:])
+    columns = rr.Transform3D.columns(translation=episode.object_pose[:, :3], mat3x3=R_world_object)
+    recording.send_columns("/world/object", _times(episode), columns)
+    recording.log("/world/object", rr.TransformAxes3D(0.08 * size(episode)), static=True)
+
+
+def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
+    series = {f"state/{k}": column for k, column in enumerate(episode.state.T)}
+    series |= {f"action/{k}": column for k, column in enumerate(episode.action.T)}
+    series |= {"success": episode.success.astype(float)}
+    for key, values in series.items():
+        group, _, k = key.partition("/")
+        colour = SERIES_RGB[int(k) % len(SERIES_RGB)] if k else SUCCESS_RGB
+        style = rr.SeriesLines(names=f"{group} {k}".strip(), colors=colour, widths=1.5)
+        recording.log(f"/scalars/{key}", style, static=True)
+        recording.send_columns(f"/scalars/{key}", _times(episode), rr.Scalars.columns(scalars=values))
