@@ -70,7 +70,7 @@ def test_killed_at_any_moment_it_opens_and_the_same_command_finishes_it(
     out = tmp_path / "killed"
     for receipts_before_kill in (1, 3):
         run = start(out)
-        wait_until(lambda: len(list(out.glob("receipts/*.json"))) >= receipts_before_kill)
+        wait_until(lambda n=receipts_before_kill: len(list(out.glob("receipts/*.json"))) >= n)
         os.kill(run.pid, signal.SIGKILL)
         run.wait()
         whole = Dataset(out)

@@ -26,8 +26,6 @@ than 1 cm in their episode; the 95th percentile of a step is {p95:.2g} mm.
 
 `shards/*.zarr` are zarr v3 groups of whole episodes; `{ends}` gives the row after each episode's last.
 
-| array | dimensions | type | unit | meaning |
-|---|---|---|---|---|
 {arrays}
 """
 
@@ -51,9 +49,14 @@ def dataset_card(manifest: Manifest, receipts: Sequence[Receipt], stats: dict[st
         moving=stats["motion"]["moving_point_share"],
         p95=stats["motion"]["step_m"]["p95"] * 1e3,
         ends=EPISODE_ENDS,
-        arrays="\n".join(
-            f"| `{s.path}`{' (optional)' if s.optional else ''} | {', '.join(s.dims)} | {s.dtype} | {s.unit} "
-            f"| {s.meaning} |"
-            for s in SCHEMA
-        ),
+        arrays=schema_table(),
     )
+
+
+def schema_table() -> str:
+    """The arrays of a shard as a Markdown table."""
+    rows = [
+        f"| `{s.path}` | {', '.join(s.dims)} | {s.dtype} | {s.unit} | {s.meaning}{'; optional' if s.optional else ''} |"
+        for s in SCHEMA
+    ]
+    return "\n".join(["| array | dimensions | type | unit | meaning |", "|---|---|---|---|---|", *rows])

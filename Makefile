@@ -1,0 +1,59 @@
+# `make demo` and `make test` set up everything they need in .venv.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do command -v $$p && break; done)
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+TASKS := hammer push drawer-open door-open
+
+.PHONY: demo test test-all lint format docs wheel benchmark clean help
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+demo: .venv/run ## extract, validate and draw episodes of four tasks on real simulation
+	$(BIN)/flowlab extract-sim $(TASKS) --episodes 3 --out demo/data
+	$(BIN)/flowlab validate demo/data
+	$(BIN)/flowlab viz demo/data --task hammer --png demo/hammer.png --save demo/hammer.rrd
+	@echo "The picture is demo/hammer.png; open the recording with: $(BIN)/rerun demo/hammer.rrd"
+
+test: .venv/test ## the tests, below 8 minutes on 2 cores
+	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+
+test-all: .venv/test ## the tests, and the slow ones: all 50 tasks, other tools' readers
+	$(BIN)/pytest -n 2 --dist loadfile
+
+lint: .venv/lint ## format, style, types, import contracts, spelling
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/codespell
+
+format: .venv/lint ## format the code and mend what can be mended
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+docs: .venv/docs ## the documentation, into site/; warnings are errors
+	$(BIN)/zensical build --clean --strict
+
+wheel: .venv/build ## build the wheel and try it in an environment of its own
+	rm -rf dist && $(BIN)/python -m build -q --wheel
+	rm -rf .venv-wheel && $(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/python -m pip --disable-pip-version-check -q install -c constraints.txt dist/*.whl
+	cd dist && ../.venv-wheel/bin/python ../tests/smoke.py
+	rm -rf .venv-wheel
+
+benchmark: .venv/benchmark ## ours against what a user would do otherwise
+	$(BIN)/python benchmarks/extract.py
+
+clean: ## remove environments and everything made by the targets above
+	rm -rf .venv .venv-wheel demo dist site
+
+.venv/run: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(PIP) install -c constraints.txt pip
+	$(PIP) install -c constraints.txt -e .
+	@touch $@
+
+.venv/%: .venv/run
+	$(PIP) install -c constraints.txt --group $*
+	@touch $@
