@@ -10,7 +10,7 @@ help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 demo: .venv/run ## extract, validate and draw episodes of four tasks on real simulation
-	$(BIN)/flowlab extract-sim $(TASKS) --episodes 3 --out demo/data
+	$(BIN)/flowlab extract-sim $(TASKS) --episodes 3 --set write.depth=true --out demo/data
 	$(BIN)/flowlab validate demo/data
 	$(BIN)/flowlab viz demo/data --task hammer --png demo/hammer.png --save demo/hammer.rrd
 	@echo "The picture is demo/hammer.png; open the recording with: $(BIN)/rerun demo/hammer.rrd"

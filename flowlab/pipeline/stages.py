@@ -28,7 +28,10 @@ class ExpertStage(Stage, ExpertSettings):
 
     def process(self, record: EpisodeRequest) -> Rollout:
         """Let the expert solve the layout of the seed."""
-        return self.studio(record.task).record_expert(record.seed, self)
+        try:
+            return self.studio(record.task).record_expert(record.seed, self)
+        except DataError as error:
+            raise Rejected(str(error)) from error
 
     def studio(self, task: str) -> Studio:
         """The simulation of a task; the last one used is kept, since units come task by task."""

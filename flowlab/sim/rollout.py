@@ -9,7 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from flowlab.config import Settings
-from flowlab.errors import FlowlabError
+from flowlab.errors import DataError, UsageError
 from flowlab.geometry.transforms import pose_9d, rigid
 from flowlab.records import Demonstration, Frame
 from flowlab.sim.environment import SceneSettings, Simulation, dp3_camera
@@ -58,7 +58,7 @@ class Studio:
 
     def __init__(self, task: str, settings: SceneSettings) -> None:
         if settings.rgb and settings.renderer != "gl":
-            raise FlowlabError("colour pictures need OpenGL; add --renderer gl (expert.scene.renderer=gl)")
+            raise UsageError("colour pictures need OpenGL; add --renderer gl (expert.scene.renderer=gl)")
         self.simulation = Simulation(task, settings)
         self._packed = PackedScene(self.simulation.scene)
         self._gl: Renderer | None = None
@@ -75,7 +75,10 @@ class Studio:
         return self._gl
 
     def record_expert(self, seed: int, settings: ExpertSettings) -> Rollout:
-        """Let the expert solve the layout of ``seed``, or try to until ``max_steps``."""
+        """Let the expert solve the layout of ``seed``, or try to until ``max_steps``.
+
+        Raises :class:`DataError` where the physics becomes unstable.
+        """
         sim = self.simulation
         sim.reset(seed)
         expert = sim.expert()
@@ -90,9 +93,8 @@ class Studio:
             successes.append(sim.step(actions[-1]))
             if settings.stop == "success" and sum(successes) >= settings.hold:
                 break
-        unstable = sim.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number
-        if unstable:
-            raise FlowlabError(f"{sim.task.name}: MuJoCo lost the simulation of seed {seed}")
+        if sim.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+            raise DataError("the physics became unstable, and MuJoCo started it anew")
         return self._rollout(seed, Poses.stack(poses), states, actions, successes)
 
     def _rollout(
