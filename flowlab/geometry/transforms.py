@@ -17,7 +17,7 @@ def inverse(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4
     return rigid(R, -np.einsum("...ij,...j->...i", R, T[..., :3, 3]))
 
 
-def apply(T: Float[np.ndarray, "*batch 4 4"], xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+def apply(T: Float[np.ndarray, "*#batch 4 4"], xyz: Float[np.ndarray, "*#batch 3"]) -> Float[np.ndarray, "*out 3"]:
     """Transform points [m]; the batch dimensions broadcast."""
     return np.einsum("...ij,...j->...i", T[..., :3, :3], xyz) + T[..., :3, 3]
 
