@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Int
 
-POINTS_PER_CELL = 24
+POINTS_PER_CELL = 96
 """Cell occupancy the grid aims at: smaller cells prune better but cost more boxes to look at."""
 
 
@@ -67,58 +67,85 @@ def _cells(xyz, cells_per_axis):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _farthest(xyz, k, taken):  # type: ignore[no-untyped-def]
-    n = len(xyz)
-    order, start = _cells(xyz, max(1, int(math.sqrt(n / POINTS_PER_CELL) * 1.25)))
+def _by_cell(xyz, order, start):  # type: ignore[no-untyped-def]
+    """Points (3, N) in cell order, and the bounding boxes (6, C) of the cells: lows, then highs."""
     cells = len(start) - 1
-    px, py, pz = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    box = np.empty((cells, 6), np.float32)
+    points, box = np.empty((3, len(xyz)), np.float32), np.empty((6, cells), np.float32)
     for c in range(cells):
         for a in range(3):
-            box[c, a], box[c, 3 + a] = xyz[order[start[c]], a], xyz[order[start[c]], a]
-        for j in range(start[c], start[c + 1]):
-            i = order[j]
-            px[j], py[j], pz[j] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            for a in range(3):
-                box[c, a] = min(box[c, a], xyz[i, a])
-                box[c, 3 + a] = max(box[c, 3 + a], xyz[i, a])
-    gap = np.full(n, np.float32(np.inf))  # squared distance to the nearest chosen point
-    far_gap = np.full(cells, np.float32(np.inf))  # the largest gap of each cell, and whose it is
-    far_index = np.empty(cells, np.int64)
-    for c in range(cells):
-        far_index[c] = order[start[c]]
+            low = high = xyz[order[start[c]], a]
+            for j in range(start[c], start[c + 1]):
+                points[a, j] = xyz[order[j], a]
+                low, high = min(low, points[a, j]), max(high, points[a, j])
+            box[a, c], box[3 + a, c] = low, high
+    return points, box
 
-    zero = np.float32(0)
+
+@numba.njit(cache=True)
+def _farthest(xyz, k, taken):  # type: ignore[no-untyped-def]
+    order, start = _cells(xyz, max(1, int(math.sqrt(len(xyz) / POINTS_PER_CELL) * 1.25)))
+    points, box = _by_cell(xyz, order, start)
+    cells = len(start) - 1
+    gap = np.full(len(xyz), np.float32(np.inf))  # squared distance of each point to the nearest chosen one
+    far = np.full(cells, np.float32(np.inf))  # the largest gap in each cell, and whose it is
+    far_index = order[start[:-1]].astype(np.int32)
+    bound = np.empty(cells, np.float32)
     out = np.empty(k, np.int64)
-    done = 0
-    new = taken[0] if len(taken) else 0
     for step in range(len(taken) + k):
-        if step >= len(taken):
-            if step > 0:
-                best = np.float32(-1)
-                for c in range(cells):
-                    if far_gap[c] > best or (far_gap[c] == best and far_index[c] < new):
-                        best, new = far_gap[c], far_index[c]
-            out[done] = new
-            done += 1
-        else:
+        if step < len(taken):
             new = taken[step]
+        else:
+            new = 0 if step == 0 else _lowest_of_farthest(far.view(np.int32), far_index)
+            out[step - len(taken)] = new
         x, y, z = xyz[new, 0], xyz[new, 1], xyz[new, 2]
+        _bound(box, x, y, z, bound)
         for c in range(cells):
-            # Rounding is monotonic, so this bound never exceeds the distance computed for a point inside.
-            dx = max(box[c, 0] - x, x - box[c, 3], zero)
-            dy = max(box[c, 1] - y, y - box[c, 4], zero)
-            dz = max(box[c, 2] - z, z - box[c, 5], zero)
-            if dx * dx + dy * dy + dz * dz >= far_gap[c]:
-                continue
-            most = np.float32(-1)
-            for j in range(start[c], start[c + 1]):
-                dx, dy, dz = px[j] - x, py[j] - y, pz[j] - z
-                gap[j] = min(gap[j], dx * dx + dy * dy + dz * dz)
-                most = max(most, gap[j])
-            for j in range(start[c], start[c + 1]):
-                if gap[j] == most:
-                    far_index[c] = order[j]
-                    break
-            far_gap[c] = most
+            if bound[c] < far[c]:
+                s, e = start[c], start[c + 1]
+                far[c], first = _update(points[0, s:e], points[1, s:e], points[2, s:e], gap[s:e], x, y, z)
+                far_index[c] = order[s + first]
     return out
+
+
+# Squared distances are never negative, and such float32 are ordered like their bits taken as integers, of
+# which, unlike of floats, the compiler finds the largest of many at once.
+
+
+@numba.njit(cache=True)
+def _lowest_of_farthest(far_bits, far_index):  # type: ignore[no-untyped-def]
+    """The lowest point index among the cells with the largest gap."""
+    best = np.int32(-1)
+    for c in range(len(far_bits)):
+        best = max(best, far_bits[c])
+    lowest = np.int32(np.iinfo(np.int32).max)
+    for c in range(len(far_bits)):
+        lowest = min(lowest, far_index[c] if far_bits[c] == best else lowest)
+    return np.int64(lowest)
+
+
+@numba.njit(cache=True)
+def _bound(box, x, y, z, bound):  # type: ignore[no-untyped-def]
+    """Squared distance to each box; rounding is monotonic, so no point inside is computed to be nearer."""
+    zero = np.float32(0)
+    x0, y0, z0, x1, y1, z1 = box[0], box[1], box[2], box[3], box[4], box[5]
+    for c in range(len(bound)):
+        dx = max(max(x0[c] - x, x - x1[c]), zero)
+        dy = max(max(y0[c] - y, y - y1[c]), zero)
+        dz = max(max(z0[c] - z, z - z1[c]), zero)
+        bound[c] = dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True)
+def _update(px, py, pz, gap, x, y, z):  # type: ignore[no-untyped-def]
+    """Lower the gaps of one cell's points to their distance from a new one; the largest left, and its place."""
+    for j in range(len(gap)):
+        dx, dy, dz = px[j] - x, py[j] - y, pz[j] - z
+        gap[j] = min(gap[j], dx * dx + dy * dy + dz * dz)
+    bits = gap.view(np.int32)
+    most = np.int32(-1)
+    for j in range(len(bits)):
+        most = max(most, bits[j])
+    first = 0
+    while bits[first] != most:
+        first += 1
+    return gap[first], first

@@ -107,26 +107,29 @@ def draw_meshes(vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam
 def _draw_triangle(screen, a, b, c, who, nearest, inverse_depth, owner):  # type: ignore[no-untyped-def]
     height, width = inverse_depth.shape
     ax, bx, cx = screen[0, a], screen[0, b], screen[0, c]
-    x0 = max(0, math.ceil(min(ax, bx, cx)))
-    x1 = min(width - 1, math.floor(max(ax, bx, cx)))
-    if x1 < x0:
-        return
     ay, by, cy = screen[1, a], screen[1, b], screen[1, c]
-    y0 = max(0, math.ceil(min(ay, by, cy)))
-    y1 = min(height - 1, math.floor(max(ay, by, cy)))
-    if y1 < y0:
+    left, right = min(ax, bx, cx), max(ax, bx, cx)
+    top, bottom = min(ay, by, cy), max(ay, by, cy)
+    if (np.floor(right) < left) | (np.floor(bottom) < top):  # most triangles lie between the pixel centres
+        return
+    # Unsigned, or numba looks out for indices counted from the end.
+    x0, x1 = np.uint32(max(0, math.ceil(left))), np.uint32(max(0, min(width, math.floor(right) + 1)))
+    y0, y1 = np.uint32(max(0, math.ceil(top))), np.uint32(max(0, min(height, math.floor(bottom) + 1)))
+    if x1 <= x0 or y1 <= y0:
         return
     az, bz, cz = screen[2, a], screen[2, b], screen[2, c]
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
     if area == 0.0 or az <= 0 or bz <= 0 or cz <= 0:
         return
     per_area = 1.0 / area
-    for y in range(y0, y1 + 1):
-        for x in range(x0, x1 + 1):
-            wb = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) * per_area
-            wc = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) * per_area
+    for y in range(y0, y1):
+        dy = np.float64(y) - ay
+        for x in range(x0, x1):
+            dx = np.float64(x) - ax
+            wb = (dx * (cy - ay) - dy * (cx - ax)) * per_area
+            wc = ((bx - ax) * dy - (by - ay) * dx) * per_area
             wa = 1.0 - wb - wc
-            if wa >= -1e-12 and wb >= -1e-12 and wc >= -1e-12:
+            if min(wa, wb, wc) >= -1e-12:
                 iz = wa * az + wb * bz + wc * cz
                 if inverse_depth[y, x] < iz <= nearest:
                     inverse_depth[y, x], owner[y, x] = iz, who

@@ -40,7 +40,6 @@ class GLRenderer:
         d.geom_xpos[:], d.geom_xmat[:] = poses.geom_pos, poses.geom_mat
         d.site_xpos[:], d.site_xmat[:] = poses.site_pos, poses.site_mat
         self._renderer.update_scene(d, self._settings.camera.name, self._options)
-        self._hide_bodies()
         self._renderer.enable_depth_rendering()
         depth = self._renderer.render().copy()
         self._renderer.disable_depth_rendering()
@@ -48,17 +47,12 @@ class GLRenderer:
         number, kind = np.moveaxis(self._renderer.render(), -1, 0)
         self._renderer.disable_segmentation_rendering()
         owner = np.full(number.shape, -1, np.int16)
-        is_geom, is_site = kind == mujoco.mjtObj.mjOBJ_GEOM, kind == mujoco.mjtObj.mjOBJ_SITE
+        # As plain numbers: comparing an array with MuJoCo's own enumeration takes milliseconds.
+        is_geom, is_site = kind == int(mujoco.mjtObj.mjOBJ_GEOM), kind == int(mujoco.mjtObj.mjOBJ_SITE)
         owner[is_geom], owner[is_site] = number[is_geom], number[is_site] + self.scene.model.ngeom
         depth[owner < 0] = 0
         rgb = self._renderer.render().copy() if self._settings.rgb else None
         return Frame(depth, self.camera, owner, self.scene.entities, rgb)
-
-    def _hide_bodies(self) -> None:
-        body_of, hidden = self.scene.model.geom_bodyid, self.scene.hidden_bodies
-        for shown in self._renderer.scene.geoms[: self._renderer.scene.ngeom]:
-            if shown.objtype == mujoco.mjtObj.mjOBJ_GEOM and body_of[shown.objid] in hidden:
-                shown.rgba[3] = 0
 
 
 def _choose_context() -> None:

@@ -52,6 +52,7 @@ class Scene:
     """The drawn things of a model, under one numbering: geoms first, then sites.
 
     The number of a thing is its index in :attr:`entities`, and what a frame stores as a pixel's owner.
+    Geoms of ``hidden_bodies`` are moved to a group of the model that no renderer draws.
     """
 
     def __init__(self, model: mujoco.MjModel, *, markers: bool = True, hidden_bodies: frozenset[str] = frozenset()):
@@ -61,7 +62,8 @@ class Scene:
         robot = {b for b, chain in enumerate(bodies) if model.body(chain[-1]).name in _ROBOT_ROOTS}
         self.movable = {int(b) for b in np.flatnonzero(model.body_weldid) if b not in robot}
         """Bodies that can move and are not the robot."""
-        self.hidden_bodies = {b for b in range(model.nbody) if model.body(b).name in hidden_bodies}
+        hidden = [b for b in range(model.nbody) if model.body(b).name in hidden_bodies]
+        model.geom_group[np.isin(model.geom_bodyid, hidden)] = _VISIBLE_GROUPS
         self.geoms = tuple(g for g in range(model.ngeom) if self._draws_geom(g))
         self.sites = tuple(s for s in range(model.nsite) if self._draws_site(s))
         self.entities = tuple(self._entity(bodies, robot, i) for i in range(model.ngeom + model.nsite))
@@ -75,7 +77,7 @@ class Scene:
     def _draws_geom(self, g: int) -> bool:
         m = self.model
         alpha = m.mat_rgba[m.geom_matid[g], 3] if m.geom_matid[g] >= 0 else m.geom_rgba[g, 3]
-        return bool(m.geom_group[g] < _VISIBLE_GROUPS and alpha > 0 and m.geom_bodyid[g] not in self.hidden_bodies)
+        return bool(m.geom_group[g] < _VISIBLE_GROUPS and alpha > 0)
 
     def _draws_site(self, s: int) -> bool:
         m = self.model
