@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,6 +53,7 @@ def extract_sim(
     """
     sys.path.insert(0, os.getcwd())  # a recipe's own stages may lie beside it
     try:
+        from flowlab.pipeline.engine import LocalEngine
         from flowlab.pipeline.recipe import load_recipe
         from flowlab.pipeline.run import Progress, extract
     except Exception as error:
@@ -71,7 +73,7 @@ def extract_sim(
     chosen = select_tasks([t for t in asked if t not in GROUPS], [*groups, *(t for t in asked if t in GROUPS)])
     if not chosen:
         raise UsageError("name the tasks to extract, as in 'flowlab extract-sim hammer push --out data/demo'")
-    share, workers = Share.parse(shard), workers or os.cpu_count() or 1
+    share, workers = Share.parse(shard), workers or len(os.sched_getaffinity(0))
     if dry_run:
         _dry_run(chosen_recipe, chosen, out, workers, as_json)
         return
@@ -82,7 +84,9 @@ def extract_sim(
             note = f"extracting ({progress.rejected} rejected)" if progress.rejected else "extracting"
             bar.update(progress.accepted, progress.wanted, note)
 
-        dataset = extract(chosen_recipe, chosen, out, workers=workers, share=share, report=show)
+        dataset = extract(
+            chosen_recipe, chosen, out, start_engine=partial(LocalEngine, workers=workers), share=share, report=show
+        )
     from flowlab.cli.reports import extraction_report, print_extraction
 
     report = extraction_report(dataset, time.monotonic() - start)

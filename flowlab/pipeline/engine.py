@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Protocol, Self
@@ -47,6 +48,10 @@ class Engine(Protocol):
     def next_outcome(self) -> Outcome:
         """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
         ...
+
+
+StartEngine = Callable[[Callable[[WorkUnit], Receipt]], AbstractContextManager[Engine]]
+"""Makes an engine that does units with the given function; leaving the context stops it."""
 
 
 class LocalEngine:

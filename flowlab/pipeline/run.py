@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.errors import FlowlabError, UnfinishedError
-from flowlab.pipeline.engine import Engine, LocalEngine, Outcome
+from flowlab.pipeline.engine import Engine, Outcome, StartEngine
 from flowlab.pipeline.recipe import Recipe, parse_recipe
 from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected
 from flowlab.pipeline.stages import ExpertStage
@@ -63,19 +63,24 @@ def extract(
     tasks: tuple[str, ...],
     folder: Path,
     *,
-    workers: int,
+    start_engine: StartEngine,
     share: Share = Share(),
     report: Callable[[Progress], None] = lambda _: None,
 ) -> Dataset:
     """Fill ``folder`` until every task has its episodes; what an earlier run did is kept.
 
+    ``start_engine`` makes an engine for the function that does a unit, as
+    ``partial(LocalEngine, workers=4)`` does.
+
     Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
     the dataset is whole in either case.
     """
     manifest = begin(folder, manifest_for(recipe, tasks))
+    log = folder / "failures.log"
+    log.unlink(missing_ok=True)
     work = partial(run_unit, recipe.model_dump_json(), manifest.settings_digest, folder)
     try:
-        with LocalEngine(work, workers) as engine:
+        with start_engine(work) as engine:
             failures = _run_all(engine, dict.fromkeys(tasks, recipe.episodes), recipe.first_seed, folder, share, report)
         dataset = summarise(folder)
     except OSError as error:
@@ -85,11 +90,11 @@ def extract(
             summarise(folder)
         raise
     if failures:
-        (folder / "failures.log").write_text("\n\n".join(f"{f.unit.name}\n{f.failure}" for f in failures))
+        log.write_text("\n\n".join(f"{f.unit.name}\n{f.failure}" for f in failures))
         last = failures[0].failure.strip().split("\n")[-1]
         raise UnfinishedError(
             f"{len(failures)} units failed, the first ({failures[0].unit.name}) with: {last}. "
-            f"All are in {folder / 'failures.log'}; the same command tries them again"
+            f"All are in {log}; the same command tries them again"
         )
     return dataset
 
