@@ -30,10 +30,10 @@ from scipy.spatial import cKDTree
 
 from flowlab.perception.observer import Observer
 from flowlab.pipeline.recipe import load_recipe
-from flowlab.pipeline.run import run_unit
 from flowlab.pipeline.stage import EpisodeRequest
 from flowlab.pipeline.stages import ExpertStage, ObserverStage
 from flowlab.pipeline.units import WorkUnit
+from flowlab.pipeline.worker import run_unit
 
 TASKS = ["hammer", "push", "door-open", "shelf-place", "assembly"]
 DP3_STEPS, DP3_TASKS = 20, 2

@@ -1,27 +1,25 @@
 """Fill a dataset by a recipe: plan units, run them on an engine, keep the books."""
 
 import errno
-import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from flowlab.errors import FlowlabError, UnfinishedError
 from flowlab.pipeline.engine import Engine, Outcome, StartEngine
-from flowlab.pipeline.recipe import Recipe, parse_recipe
-from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected
+from flowlab.pipeline.recipe import Recipe
+from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.stages import ExpertStage
 from flowlab.pipeline.units import Share, WorkUnit, next_units
+from flowlab.pipeline.worker import run_unit
 from flowlab.sim.rollout import Studio
-from flowlab.storage import stats
-from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
-from flowlab.storage.manifest import Manifest, Receipt, Reject, read_receipts
+from flowlab.storage.dataset import Dataset, begin, summarise
+from flowlab.storage.manifest import Manifest, Receipt, read_receipts
 from flowlab.storage.schema import SCHEMA
-from flowlab.storage.shard import episode_digest
 
 _WORLD_FRAMES = {
     "flowlab": "MetaWorld's own: z up, table top at z = 0 in most tasks, the robot's base at the origin facing +y",
@@ -129,40 +127,6 @@ def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int)
         "estimated_megabytes": round(todo * frame_bytes / 1e6, 1),
         "out": str(folder),
     }
-
-
-def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUnit) -> Receipt:
-    """Do a unit: its episodes into its shard, its receipt beside them. Runs in a worker."""
-    pipeline = _pipeline(recipe_json)
-    before = dict(pipeline.tallies)
-    episodes, rejects = [], []
-    for seed in unit.seeds:
-        try:
-            episodes.append(pipeline.run(EpisodeRequest(task=unit.task, seed=seed)))
-        except Rejected as rejected:
-            stage, reason = rejected.args
-            rejects.append(Reject(task=unit.task, seed=seed, stage=stage, reason=reason))
-    if episodes:
-        pipeline.store(folder / "shards" / f"{unit.name}.zarr", episodes, settings_digest)
-    receipt = Receipt(
-        unit=unit.name,
-        task=unit.task,
-        seeds=unit.seeds,
-        accepted=tuple(e.seed for e in episodes),
-        frames=tuple(len(e) for e in episodes),
-        digests=tuple(episode_digest(e) for e in episodes),
-        rejects=tuple(rejects),
-        stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
-        stats=stats.summarise(episodes) if episodes else {},
-        peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-    )
-    keep_receipt(folder, receipt)
-    return receipt
-
-
-@lru_cache(maxsize=1)
-def _pipeline(recipe_json: str) -> Pipeline:
-    return parse_recipe(recipe_json, "recipe").pipeline()
 
 
 def _run_all(
