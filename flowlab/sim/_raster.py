@@ -1,12 +1,9 @@
-"""The z-buffer's inner loops. Inverse z-depth [1/m] is linear over a triangle in the image; larger wins."""
+"""The z-buffer's inner loops for meshes. Inverse z-depth [1/m] is linear over a triangle in the image; larger wins."""
 
 import math
 
 import numba
 import numpy as np
-
-PLANE, SPHERE, CAPSULE, CYLINDER, BOX = 0, 2, 3, 5, 6
-"""MuJoCo's geom types (mjtGeom)."""
 
 
 @numba.njit(cache=True)
@@ -21,7 +18,7 @@ def to_depth(inverse_depth):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _local_to_cam(pos, mat, T_cam_world):  # type: ignore[no-untyped-def]
+def local_to_cam(pos, mat, T_cam_world):  # type: ignore[no-untyped-def]
     """Rotation and translation from a thing's own frame to the camera's."""
     R, t = np.empty((3, 3)), np.empty(3)
     for i in range(3):
@@ -37,7 +34,7 @@ def _local_to_cam(pos, mat, T_cam_world):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _pixel_box(R, t, centre, half, K, width, height):  # type: ignore[no-untyped-def]
+def pixel_box(R, t, centre, half, K, width, height):  # type: ignore[no-untyped-def]
     """Inclusive pixel bounds of a box in its own frame and its least z-depth; all pixels if it reaches behind."""
     u0, u1, v0, v1, z0 = math.inf, -math.inf, math.inf, -math.inf, math.inf
     for corner in range(8):
@@ -71,7 +68,7 @@ def _hidden(bounds, inverse_depth):  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")  # a vertex may lie in the camera's own plane
 def draw_meshes(vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam_world, nearest, inverse_depth, owner):  # type: ignore[no-untyped-def]  # fmt: skip
     """Draw front faces into ``inverse_depth`` (H, W) and ``owner`` (H, W); parameters as in ``_Meshes``."""
     height, width = inverse_depth.shape
@@ -79,9 +76,10 @@ def draw_meshes(vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam
         return
     screen = np.empty((3, span[:, 1].max()))  # u, v, 1/z of every vertex of one mesh
     front = np.empty(span[:, 3].max(), np.int64)
+    clipped = np.empty((3, 4))
     for g in range(len(entity)):
-        R, t = _local_to_cam(pos[entity[g]], mat[entity[g]], T_cam_world)
-        bounds = _pixel_box(R, t, boxes[g, :3], boxes[g, 3:], K, width, height)
+        R, t = local_to_cam(pos[entity[g]], mat[entity[g]], T_cam_world)
+        bounds = pixel_box(R, t, boxes[g, :3], boxes[g, 3:], K, width, height)
         if bounds[0] > bounds[1] or bounds[2] > bounds[3] or _hidden(bounds, inverse_depth):
             continue
         first_vertex, n_vertices, first_face, n_faces = span[g]
@@ -100,7 +98,35 @@ def draw_meshes(vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam
             front[n_front] = f
             n_front += planes[0, f] * ex + planes[1, f] * ey + planes[2, f] * ez > planes[3, f]
         for f in front[:n_front]:
-            _draw_triangle(screen, faces[f, 0], faces[f, 1], faces[f, 2], entity[g], nearest, inverse_depth, owner)
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            if min(screen[2, a], screen[2, b], screen[2, c]) > 0:
+                _draw_triangle(screen, a, b, c, entity[g], nearest, inverse_depth, owner)
+            elif max(screen[2, a], screen[2, b], screen[2, c]) > 0:
+                n = _clip(vertices[first_vertex:], (a, b, c), R, t, K, nearest, clipped)
+                for k in range(2, n):
+                    _draw_triangle(clipped, 0, k - 1, k, entity[g], nearest, inverse_depth, owner)
+
+
+@numba.njit(cache=True)
+def _clip(vertices, corners, R, t, K, nearest, clipped):  # type: ignore[no-untyped-def]
+    """The part of a triangle beyond the near plane, as a polygon of up to 4 screen corners; their number."""
+    near = 1.0 / nearest
+    cam = np.empty((3, 3))
+    for i in range(3):
+        for axis in range(3):
+            cam[i, axis] = t[axis]
+            for k in range(3):
+                cam[i, axis] += R[axis, k] * vertices[corners[i], k]
+    n = 0
+    for i in range(3):
+        p, q = cam[i], cam[(i + 1) % 3]
+        for share in (0.0, (near - p[2]) / (q[2] - p[2]) if (p[2] < near) != (q[2] < near) else -1.0):
+            if share > 0.0 or (share == 0.0 and p[2] >= near):
+                x, y, z = p[0] + share * (q[0] - p[0]), p[1] + share * (q[1] - p[1]), p[2] + share * (q[2] - p[2])
+                clipped[0, n], clipped[1, n] = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+                clipped[2, n] = 1.0 / z
+                n += 1
+    return n
 
 
 @numba.njit(cache=True, inline="always")
@@ -119,7 +145,7 @@ def _draw_triangle(screen, a, b, c, who, nearest, inverse_depth, owner):  # type
         return
     az, bz, cz = screen[2, a], screen[2, b], screen[2, c]
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    if area == 0.0 or az <= 0 or bz <= 0 or cz <= 0:
+    if area == 0.0:
         return
     per_area = 1.0 / area
     for y in range(y0, y1):
@@ -133,96 +159,3 @@ def _draw_triangle(screen, a, b, c, who, nearest, inverse_depth, owner):  # type
                 iz = wa * az + wb * bz + wc * cz
                 if inverse_depth[y, x] < iz <= nearest:
                     inverse_depth[y, x], owner[y, x] = iz, who
-
-
-@numba.njit(cache=True)
-def draw_primitives(entity, kind, size, pos, mat, K, T_cam_world, nearest, inverse_depth, owner):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Draw the first entry of every pixel's ray into each primitive; parameters as in ``_Primitives``."""
-    height, width = inverse_depth.shape
-    origin, centre = np.empty(3), np.zeros(3)
-    for g in range(len(entity)):
-        R, t = _local_to_cam(pos[entity[g]], mat[entity[g]], T_cam_world)
-        for a in range(3):
-            origin[a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
-        if kind[g] == PLANE:
-            u0, u1, v0, v1 = 0, width - 1, 0, height - 1
-        else:
-            bounds = _pixel_box(R, t, centre, _half_size(kind[g], size[g]), K, width, height)
-            u0, u1, v0, v1 = bounds[0], bounds[1], bounds[2], bounds[3]
-        for v in range(v0, v1 + 1):
-            y = (v - K[1, 2]) / K[1, 1]
-            for u in range(u0, u1 + 1):
-                x = (u - K[0, 2]) / K[0, 0]
-                # A direction with z = 1 in the camera's frame makes the ray's parameter the z-depth.
-                dx = R[0, 0] * x + R[1, 0] * y + R[2, 0]
-                dy = R[0, 1] * x + R[1, 1] * y + R[2, 1]
-                dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
-                depth = _first_entry(kind[g], size[g], origin, dx, dy, dz)
-                if depth > 0 and inverse_depth[v, u] < 1.0 / depth <= nearest:
-                    inverse_depth[v, u], owner[v, u] = 1.0 / depth, entity[g]
-
-
-@numba.njit(cache=True)
-def _half_size(kind, size):  # type: ignore[no-untyped-def]
-    """Half size of a primitive's bounding box in its own frame."""
-    half = size.copy()
-    if kind == SPHERE:
-        half[1] = half[2] = size[0]
-    elif kind == CYLINDER:
-        half[1], half[2] = size[0], size[1]
-    elif kind == CAPSULE:
-        half[1], half[2] = size[0], size[1] + size[0]
-    return half
-
-
-@numba.njit(cache=True)
-def _sphere_entry(o, radius, dx, dy, dz, oz):  # type: ignore[no-untyped-def]
-    """First entry into a sphere at height -oz above the local origin; infinite if the ray misses it."""
-    a = dx * dx + dy * dy + dz * dz
-    b = o[0] * dx + o[1] * dy + oz * dz
-    c = o[0] * o[0] + o[1] * o[1] + oz * oz - radius * radius
-    root = b * b - a * c
-    return (-b - math.sqrt(root)) / a if root >= 0 else math.inf
-
-
-@numba.njit(cache=True)
-def _first_entry(kind, size, o, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Parameter at which the ray o + s d enters a primitive from outside; 0 if it does not."""
-    best = math.inf
-    if kind == BOX:
-        enter, leave = -math.inf, math.inf
-        for axis in range(3):
-            d = dx if axis == 0 else (dy if axis == 1 else dz)
-            if abs(d) < 1e-15:
-                if abs(o[axis]) > size[axis]:
-                    return 0.0
-                continue
-            near, far = (-size[axis] - o[axis]) / d, (size[axis] - o[axis]) / d
-            enter, leave = max(enter, min(near, far)), min(leave, max(near, far))
-        return enter if 0 < enter <= leave else 0.0
-    if kind == PLANE:
-        s = -o[2] / dz if dz < 0 < o[2] else 0.0
-        inside_x = size[0] <= 0 or abs(o[0] + s * dx) <= size[0]
-        inside_y = size[1] <= 0 or abs(o[1] + s * dy) <= size[1]
-        return s if inside_x and inside_y else 0.0
-    if kind == SPHERE:
-        best = _sphere_entry(o, size[0], dx, dy, dz, o[2])
-    else:
-        radius, half = size[0], size[1]
-        a, b = dx * dx + dy * dy, o[0] * dx + o[1] * dy
-        root = b * b - a * (o[0] * o[0] + o[1] * o[1] - radius * radius)
-        if root >= 0 and a > 1e-15:
-            s = (-b - math.sqrt(root)) / a
-            if s > 0 and abs(o[2] + s * dz) <= half:
-                best = s
-        for end in (-1.0, 1.0):
-            if kind == CYLINDER and dz * end < 0:
-                s = (end * half - o[2]) / dz
-                x, y = o[0] + s * dx, o[1] + s * dy
-                if 0 < s < best and x * x + y * y <= radius * radius:
-                    best = s
-            elif kind == CAPSULE:
-                s = _sphere_entry(o, radius, dx, dy, dz, o[2] - end * half)
-                if 0 < s < best and end * (o[2] + s * dz) >= half:
-                    best = s
-    return best if 0 < best < math.inf else 0.0

@@ -11,6 +11,7 @@ from metaworld import policies
 from pydantic import Field
 
 from flowlab.config import Settings
+from flowlab.errors import unknown
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import inverse, rigid
 from flowlab.sim.scene import Poses, Scene
@@ -67,6 +68,7 @@ class Simulation:
         self._env = env
         self.model: mujoco.MjModel = env.model
         self.data: mujoco.MjData = env.data
+        _check_camera(self.model, settings.camera.name)
         if settings.camera.position is not None:
             self.model.cam(settings.camera.name).pos[:] = settings.camera.position
         self.scene = Scene(self.model, markers=settings.markers, hidden_bodies=settings.hidden_bodies)
@@ -137,6 +139,13 @@ class Expert:
             warnings.simplefilter("ignore")  # the policies warn at every step that needs clipping
             action = self._policy.get_action(self._simulation._observation)
         return np.clip(action, -1, 1).astype(np.float32)
+
+
+def _check_camera(model: mujoco.MjModel, name: str) -> None:
+    """Refuse a camera that does not exist or rides on something that moves: an episode has one camera pose."""
+    fixed = [model.cam(c).name for c in range(model.ncam) if model.body_weldid[model.cam_bodyid[c]] == 0]
+    if name not in fixed:
+        raise unknown("camera that stands still", name, fixed)
 
 
 def _names_below(model: mujoco.MjModel, body: int) -> set[str]:

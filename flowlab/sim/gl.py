@@ -1,5 +1,6 @@
 """Pictures by MuJoCo's own OpenGL renderer: the second opinion on depth, and the only source of colour."""
 
+import atexit
 import importlib
 import os
 import weakref
@@ -31,8 +32,12 @@ class GLRenderer:
             self._options.sitegroup[:] = 0
         _choose_context()
         self._renderer = mujoco.Renderer(scene.model, camera.height, camera.width)
-        # At exit the context must go before the libraries it needs.
-        self.close = weakref.finalize(self, self._renderer.close)
+        # At exit the context must go before the display it is of, which went to MuJoCo's own exit handler.
+        atexit.register(_close_if_alive, weakref.ref(self))
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self._renderer.close()
 
     def frame(self, poses: Poses) -> Frame:
         """Depth, owners and, if asked for, colour of the scene with everything at the given poses."""
@@ -55,6 +60,12 @@ class GLRenderer:
         return Frame(depth, self.camera, owner, self.scene.entities, rgb)
 
 
+def _close_if_alive(renderer: weakref.ref[GLRenderer]) -> None:
+    alive = renderer()
+    if alive is not None:
+        alive.close()
+
+
 def _choose_context() -> None:
     """Make MuJoCo use the back end of MUJOCO_GL, or EGL, which works without a display.
 
@@ -64,7 +75,10 @@ def _choose_context() -> None:
     backend = os.environ.get("MUJOCO_GL") or "egl"
     try:
         context = importlib.import_module(f"mujoco.{backend}").GLContext
-        context(1, 1).free()
+        probe = context(1, 1)
+        probe.make_current()
+        mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100).free()
+        probe.free()
     except Exception as error:  # every back end fails in its own way
         raise MissingLibraryError(_INSTALL.format(reason=f"{backend}: {error}")) from error
     mujoco.gl_context.GLContext = context

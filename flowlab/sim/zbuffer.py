@@ -9,7 +9,8 @@ from flowlab.errors import FlowlabError
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import inverse
 from flowlab.records import Frame
-from flowlab.sim._raster import draw_meshes, draw_primitives, to_depth
+from flowlab.sim._primitives import draw_primitives
+from flowlab.sim._raster import draw_meshes, to_depth
 from flowlab.sim.scene import Poses, Scene
 
 _DRAWN_TYPES = {
