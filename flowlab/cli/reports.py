@@ -77,6 +77,6 @@ def print_extraction(report: dict[str, Any]) -> None:
     if len(report["rejects"]) > 10:
         click.echo(f"... and {len(report['rejects']) - 10} more, all in {report['dataset']}/rejects.jsonl")
     click.echo(
-        f"Episodes: {report['episodes']}, frames: {report['frames']}, in {report['dataset']} "
+        f"{report['episodes']} episodes, {report['frames']} frames in {report['dataset']} "
         f"({report['wall_s']:.1f} s). Next: flowlab validate {report['dataset']}"
     )

@@ -19,7 +19,8 @@ def farthest_points(
     nested (the first m of k are the answer for m), equal to the textbook O(N k) loop on float32
     coordinates, and the same on every machine: no fast-math, no fused operations.
 
-    ``chosen`` are indices taken already: the sampling goes on from them and does not return them.
+    ``chosen`` are indices taken already, from which the sampling goes on. Where every point that is left
+    coincides with a chosen one, indices repeat, as in the textbook loop; depth pictures give no such points.
 
     Method: points are sorted into grid cells; a cell whose bounding box is farther from the new point
     than every one of its points is from the old ones cannot change and is skipped.

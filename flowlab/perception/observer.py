@@ -19,7 +19,9 @@ class Box(Settings):
     """An axis-aligned box in the world frame [m]; points strictly inside are kept."""
 
     low: Vector3
+    """Least x, y, z."""
     high: Vector3
+    """Greatest x, y, z."""
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Box":

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +37,11 @@ class Recipe(Settings):
     def _find_stages(cls, values: Any) -> list[Any]:
         if not isinstance(values, list | tuple):
             raise ValueError("must be a list of stages")
-        return [v if isinstance(v, Stage) else _make_stage(v) for v in values]
+        stages = [v if isinstance(v, Stage) else _make_stage(v) for v in values]
+        for name, times in Counter(s.stage for s in stages).items():
+            if times > 1:
+                raise UsageError(f"stage '{name}' appears {times} times; settings are kept by name, so once is all")
+        return stages
 
     def pipeline(self) -> Pipeline:
         """The stages, joined and checked."""
@@ -61,6 +66,8 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
             text = path.read_text()
         except OSError as error:
             raise UsageError(f"{path}: cannot read the recipe ({error.strerror})") from error
+        except UnicodeDecodeError as error:
+            raise UsageError(f"{path}: cannot read the recipe (it is no UTF-8 text)") from error
     return parse_recipe(text, str(name), overrides)
 
 
@@ -117,10 +124,12 @@ def _import_stage(name: str) -> type[Stage]:
 def _override(values: dict[str, Any], text: str) -> None:
     """Apply ``observer.points=512``: the first part is a stage's name or a key of the recipe."""
     key, equals, value = text.partition("=")
-    first, *rest = key.split(".")
+    stages = {s["stage"]: s for s in values.get("stages") or () if isinstance(s, dict) and "stage" in s}
+    # A stage named by import path has dots of its own.
+    whole = next((name for name in stages if key.startswith(f"{name}.")), None)
+    first, *rest = key.split(".") if whole is None else [whole, *key.removeprefix(f"{whole}.").split(".")]
     if not equals or not all([first, *rest]):
         raise UsageError(f"--set {text}: must look like observer.points=512")
-    stages = {s["stage"]: s for s in values.get("stages", []) if isinstance(s, dict) and "stage" in s}
     known = [*stages, *(k for k in Recipe.model_fields if k != "stages")]
     if first not in known:
         raise unknown("stage or key of this recipe", first, known)
@@ -131,7 +140,10 @@ def _override(values: dict[str, Any], text: str) -> None:
         target = target.setdefault(part, {})
         if not isinstance(target, dict):
             raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
-    target[path[-1]] = yaml.safe_load(value)
+    try:
+        target[path[-1]] = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise UsageError(f"--set {text}: not valid YAML: '{value}'") from error
 
 
 def _explain(error: ValidationError, model: type[Settings]) -> str:

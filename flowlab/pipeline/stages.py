@@ -25,6 +25,7 @@ class ExpertStage(Stage, ExpertSettings):
 
     stage: Literal["expert"] = "expert"
     scene: SceneSettings = SceneSettings()
+    """What the camera is shown."""
 
     def process(self, record: EpisodeRequest) -> Rollout:
         """Let the expert solve the layout of the seed."""

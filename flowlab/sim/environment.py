@@ -31,13 +31,16 @@ class CameraSettings(Settings):
     position: tuple[float, float, float] | None = (0.6, 0.295, 0.8)
     """Moves the camera there [m]; DP3's and 3D FDP's position. null leaves it where the model has it."""
     width: int = Field(default=128, gt=0)
+    """[px]"""
     height: int = Field(default=128, gt=0)
+    """[px]"""
 
 
 class SceneSettings(Settings):
     """What the camera is shown, and in which frame the labels are given."""
 
     camera: CameraSettings = CameraSettings()
+    """Where it is looked at from."""
     renderer: Literal["zbuffer", "gl"] = "zbuffer"
     """``zbuffer`` needs no OpenGL; ``gl`` is MuJoCo's own renderer. They agree (see the tests)."""
     rgb: bool = False

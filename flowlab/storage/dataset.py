@@ -106,7 +106,9 @@ def begin(folder: Path, manifest: Manifest) -> Manifest:
         # Through JSON, so that tuples and lists compare as they are stored.
         mine = json.loads(manifest.model_dump_json())
         theirs = json.loads(old.model_dump_json())
-        compared = ("settings", "first_seed", "camera")
+        for values in (theirs, mine):
+            values["stages"] = list(values["settings"])
+        compared = ("stages", "settings", "first_seed", "camera")
         lines = list(differences({k: theirs[k] for k in compared}, {k: mine[k] for k in compared}))
         if lines:
             raise DataError(

@@ -21,6 +21,10 @@ def export_dp3(dataset: Dataset, path: Path, task: str | None = None) -> int:
     """
     if path.exists():
         raise DataError(f"{path}: exists already; remove it or choose another --out")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror}); choose another --out") from error
     chosen = [ref for ref in dataset.refs if task in (None, ref.task)]
     if not chosen:
         raise DataError(f"{dataset.path}: no episodes of '{task}'; it has {', '.join(dataset.manifest.requested)}")

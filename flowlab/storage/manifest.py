@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import ValidationError, model_validator
 
 from flowlab import __version__
 from flowlab.config import Settings
@@ -43,7 +43,8 @@ class Manifest(Settings):
     @property
     def settings_digest(self) -> str:
         """Identifies the settings; every shard carries it."""
-        return hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()[:16]
+        stages = list(json.loads(self.model_dump_json())["settings"].items())  # in order, which matters too
+        return hashlib.sha256(json.dumps(stages, sort_keys=True).encode()).hexdigest()[:16]
 
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
@@ -115,6 +116,12 @@ class Receipt(Settings):
     peak_memory_mb: float = 0.0
     flowlab: str = __version__
 
+    @model_validator(mode="after")
+    def _lists_match(self) -> "Receipt":
+        if not len(self.accepted) == len(self.frames) == len(self.digests):
+            raise ValueError("accepted, frames and digests must be equally long")
+        return self
+
     @property
     def shard(self) -> str:
         """Path of the shard below the dataset."""
@@ -131,7 +138,8 @@ def read_receipts(folder: Path) -> list[Receipt]:
             receipts.append(Receipt.model_validate(read_json(path)))
         except ValidationError as error:
             first = error.errors()[0]
-            raise DataError(f"{path}: field '{'.'.join(map(str, first['loc']))}': {first['msg']}") from error
+            field = ".".join(map(str, first["loc"])) or "lists"
+            raise DataError(f"{path}: field '{field}': {first['msg']}") from error
     return sorted(receipts, key=lambda r: (r.task, r.seeds))
 
 

@@ -1,10 +1,12 @@
 """One shard: a zarr v3 group of whole episodes, there under its name only when complete."""
 
+import errno
 import hashlib
 import os
 import shutil
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +32,34 @@ def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str) -
     """
     files = _encode(episodes, settings_digest)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_temporary_prefix()}{os.getpid()}-{path.name}")
+    temporary = path.with_name(f"{_temporary_prefix()}{os.getpid()}+{path.name}")
     try:
         for name, content in files.items():
             file = temporary / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
-        if path.exists():
-            shutil.rmtree(path, ignore_errors=True)
-        os.rename(temporary, path)
+        _replace(path, temporary)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _replace(path: Path, whole: Path) -> None:
+    """Put a folder in the place of another, which is moved away first: deleting takes time, and may be cut short.
+
+    Another job may do the same at the same moment, with the same content.
+    """
+    while True:
+        old = whole.with_name(f"{whole.name}-old")
+        with suppress(FileNotFoundError):
+            os.rename(path, old)
+        try:
+            os.rename(whole, path)
+            return
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def episode_digest(episode: Episode) -> str:
@@ -56,7 +75,7 @@ def episode_digest(episode: Episode) -> str:
 def remove_leftovers(folder: Path) -> None:
     """Delete temporary shards of processes of this machine that no longer run."""
     for leftover in folder.glob(f"{_temporary_prefix()}*"):
-        pid = int(leftover.name.removeprefix(_temporary_prefix()).partition("-")[0])
+        pid = int(leftover.name.removeprefix(_temporary_prefix()).partition("+")[0])
         if not _runs(pid):
             shutil.rmtree(leftover, ignore_errors=True)
 
@@ -71,6 +90,9 @@ class Shard:
         except (FileNotFoundError, ValueError, KeyError) as error:
             raise DataError(f"{path}: not a readable zarr v3 group ({_first_line(error)}); {_REDO}") from error
         self.attributes: Mapping[str, Any] = self.group.attrs.asdict()
+        lacking = {"episodes", "camera", "entities", "settings_digest"} - self.attributes.keys()
+        if lacking:
+            raise DataError(f"{path}: not a shard of flowlab (it lacks {', '.join(sorted(lacking))}); {_REDO}")
 
     def __len__(self) -> int:
         return len(self.attributes["episodes"])
@@ -78,27 +100,36 @@ class Shard:
     def array(self, spec_path: str) -> np.ndarray:
         """A whole array; a missing or damaged chunk is an error, never silent zeros."""
         place = f"{self.path}/{spec_path}"
+        array = self._open(spec_path)
+        missing = array.nchunks - array.nchunks_initialized
+        if missing:
+            raise DataError(f"{place}: {missing} of {array.nchunks} chunks missing; {_REDO}")
         try:
-            array = self.group[spec_path]
-            assert isinstance(array, zarr.Array)
-            if array.nchunks_initialized != array.nchunks:
-                raise DataError(
-                    f"{place}: {array.nchunks - array.nchunks_initialized} of {array.nchunks} chunks missing; {_REDO}"
-                )
             return np.asarray(array[...])
-        except KeyError as error:
-            raise DataError(f"{place}: the array is missing; {_REDO}") from error
         except (ValueError, RuntimeError, OSError) as error:
             raise DataError(f"{place}: damaged ({_first_line(error)}); {_REDO}") from error
 
+    def _open(self, spec_path: str) -> "zarr.Array[Any]":
+        """An array, its values unread."""
+        place = f"{self.path}/{spec_path}"
+        try:
+            array = self.group[spec_path]
+        except KeyError as error:
+            raise DataError(f"{place}: the array is missing; {_REDO}") from error
+        except (ValueError, TypeError, OSError) as error:
+            raise DataError(f"{place}: damaged ({_first_line(error)}); {_REDO}") from error
+        if not isinstance(array, zarr.Array):
+            raise DataError(f"{place}: damaged (it is no array); {_REDO}")
+        return array
+
     def has(self, spec: ArraySpec) -> bool:
         """Whether the shard holds an array."""
-        return spec.path in self.group
+        return (self.path / spec.path).exists()
 
     def describe(self) -> list[dict[str, Any]]:
         """Name, dimensions, shape, type and unit of every array."""
         paths = [*(s.path for s in SCHEMA if self.has(s)), EPISODE_ENDS]
-        arrays = {p: a for p in paths if isinstance(a := self.group[p], zarr.Array)}
+        arrays = {path: self._open(path) for path in paths}
         return [
             {
                 "array": path,
@@ -156,11 +187,20 @@ class Shard:
 _REDO = "delete the unit's receipt and run the same extract command again to make it anew"
 
 
+_SHARED: dict[str, Callable[[Episode], object]] = {
+    "camera": lambda e: e.camera.to_json(),
+    "entities": lambda e: e.queries.entities,
+    "arrays": lambda e: [spec.path for spec in SCHEMA if spec.of(e) is not None],
+}
+"""What a shard holds once for all of its episodes."""
+
+
 def _encode(episodes: Sequence[Episode], settings_digest: str) -> dict[str, bytes]:
     """The files of a shard, by relative path."""
     first = episodes[0]
-    if any(e.camera.to_json() != first.camera.to_json() for e in episodes):
-        raise DataError("the episodes of one shard must share one camera")
+    for name, of in _SHARED.items():
+        if any(of(e) != of(first) for e in episodes):
+            raise DataError(f"the episodes of one shard must share their {name}")
     store: dict[str, Any] = {}
     group = zarr.create_group(
         MemoryStore(store),
@@ -175,7 +215,7 @@ def _encode(episodes: Sequence[Episode], settings_digest: str) -> dict[str, byte
     )
     for spec in SCHEMA:
         parts = [part for e in episodes if (part := spec.of(e)) is not None]
-        if parts:
+        if parts:  # all of them, or an optional array that none has
             _write(group, spec.path, np.concatenate(parts).astype(spec.dtype), spec.dims, spec.unit, spec.meaning)
     ends = np.cumsum([len(e) for e in episodes], dtype=np.int64)
     _write(group, EPISODE_ENDS, ends, ("episode",), "1", "the row after each episode's last")
@@ -195,7 +235,7 @@ def _write(group: zarr.Group, path: str, values: np.ndarray, dims: tuple[str, ..
 
 
 def _temporary_prefix() -> str:
-    return f".tmp-{socket.gethostname()}-"
+    return f".tmp-{socket.gethostname()}+"  # no machine's name has a plus sign
 
 
 def _runs(pid: int) -> bool:

@@ -106,10 +106,16 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard) -> Iterator[F
         yield problem.under(place)
     if problems:
         return
-    for k, episode in enumerate(shard.episodes()):
+    episodes = list(shard.episodes())
+    held = [(e.task, e.seed, len(e)) for e in episodes]
+    told = [(receipt.task, *x) for x in zip(receipt.accepted, receipt.frames, strict=True)]
+    if held != told:
+        yield Finding(place, f"holds (task, seed, frames) {held}, its receipt says {told}; {_ANEW}")
+        return
+    for episode, digest in zip(episodes, receipt.digests, strict=True):
         for problem in _episode_problems(episode, dataset.manifest.settings):
             yield problem.under(place, f"seed {episode.seed}: ")
-        if episode_digest(episode) != receipt.digests[k]:
+        if episode_digest(episode) != digest:
             yield Finding(place, f"seed {episode.seed}: content differs from what its receipt says; {_ANEW}")
 
 
