@@ -14,7 +14,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int16, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int16, Int32, UInt8
 
 from flowlab.geometry.camera import Camera
 
@@ -107,6 +107,8 @@ class Demonstration(ABC):
     task: str
     seed: int
     camera: Camera
+    time_s: Float64[np.ndarray, "T"]
+    """When each row was, since the first [s]."""
     state: Float32[np.ndarray, "T S"]
     action: Float32[np.ndarray, "T A"]
     """The action taken after the observation of the same row, as executed."""
@@ -154,6 +156,7 @@ class Episode:
     task: str
     seed: int
     camera: Camera
+    time_s: Float64[np.ndarray, "T"]
     point_cloud: Float32[np.ndarray, "T N 3"]
     point_count: Int32[np.ndarray, "T"]
     state: Float32[np.ndarray, "T S"]

@@ -47,6 +47,7 @@ def episode() -> Episode:
         task="slide",
         seed=7,
         camera=Camera.from_fovy(40, 30, 50.0, T_world_cam),
+        time_s=np.arange(T) * 0.0125,
         point_cloud=cloud.astype(np.float32),
         point_count=np.full(T, DISTINCT_POINTS, np.int32),
         state=rng.normal(size=(T, 3)).astype(np.float32),
@@ -260,7 +261,7 @@ def test_a_camera_that_hangs_upside_down_sees_the_same(episode: Episode, tmp_pat
 
 
 def test_one_frame_is_enough(episode: Episode, tmp_path: Path) -> None:
-    names = ["point_cloud", "point_count", "state", "action", "success", "object_pose", "depth", "rgb"]
+    names = ["time_s", "point_cloud", "point_count", "state", "action", "success", "object_pose", "depth", "rgb"]
     tracks = replace(episode.tracks, xyz_world=episode.tracks.xyz_world[:1], visible=episode.tracks.visible[:1])
     one = replace(episode, tracks=tracks, **{name: getattr(episode, name)[:1] for name in names})
     assert recorded(one, tmp_path)["/world/tracks/points", "step"] == [0]

@@ -105,6 +105,7 @@ class RigidFlowStage(Stage, RigidFlowSettings):
             task=demo.task,
             seed=demo.seed,
             camera=demo.camera,
+            time_s=demo.time_s,
             point_cloud=seen.points_world,
             point_count=seen.point_count,
             state=demo.state,

@@ -93,8 +93,13 @@ class Simulation:
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
+    @property
+    def step_seconds(self) -> float:
+        """Duration of a control step [s]; 0.0125 in MetaWorld."""
+        return float(self._env.dt)
+
     def step(self, action: Float32[np.ndarray, "4"]) -> bool:
-        """Execute an action for one control step (12.5 ms); whether the task now counts as solved."""
+        """Execute an action for one control step; whether the task now counts as solved."""
         self._observation, _, _, _, info = self._env.step(action)
         return bool(info["success"])
 

@@ -110,6 +110,7 @@ class Studio:
             task=sim.task.name,
             seed=seed,
             camera=camera,
+            time_s=np.arange(len(actions)) * sim.step_seconds,
             state=np.stack(states),
             action=np.stack(actions),
             success=np.array(successes),

@@ -17,7 +17,7 @@ from flowlab.storage.schema import SCHEMA_VERSION
 MANIFEST = "flowlab.json"
 UNITS = {
     "length": "m",
-    "time_step": "12.5 ms in MetaWorld",
+    "time": "s",
     "camera": "OpenCV axes (x right, y down, z forward); pixel centres at integer coordinates",
     "rotation": "6D: first two columns of the rotation matrix",
 }

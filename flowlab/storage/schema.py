@@ -39,6 +39,7 @@ def _row(value: object, dtype: str) -> np.ndarray:
 
 
 SCHEMA = (
+    ArraySpec("data/time", "float64", ("time",), "s", "since the first row of the episode", lambda e: e.time_s),
     ArraySpec(
         "data/point_cloud", "float32", ("time", "point", "xyz"), "m",
         "what a policy sees: farthest-point sample of the cropped cloud, in that order, in the world frame",

@@ -168,6 +168,7 @@ class Shard:
             task=about["task"],
             seed=int(columns["meta/seed"]),
             camera=Camera.from_json(self.attributes["camera"]),
+            time_s=columns["data/time"],
             point_cloud=columns["data/point_cloud"],
             point_count=columns["data/point_count"],
             state=columns["data/state"],

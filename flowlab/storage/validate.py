@@ -154,7 +154,7 @@ _SIZE_OF = {"point": "observer", "query": "queries"}
 
 def _episode_problems(e: Episode, settings: Mapping[str, Any]) -> Iterator[_Problem]:
     for spec in SCHEMA:
-        values = spec.of(e) if spec.dtype == "float32" else None
+        values = spec.of(e) if spec.dtype.startswith("float") else None
         if values is not None and not np.isfinite(values).all():
             row = int(np.argwhere(~np.isfinite(values))[0][0])
             yield _Problem(spec.path, f"not finite at step {row}" if spec.per_step else "not finite")
@@ -172,6 +172,11 @@ def _teleports(e: Episode) -> Iterator[_Problem]:
         yield _Problem(
             "data/tracks", f"point {m} jumps {step.max():.3f} m after step {t}; at most {TELEPORT} is possible"
         )
+
+
+def _times(e: Episode) -> Iterator[_Problem]:
+    if not (np.diff(e.time_s) > 0).all():
+        yield _Problem("data/time", f"does not rise after step {int((np.diff(e.time_s) <= 0).argmax())}")
 
 
 def _counts(e: Episode) -> Iterator[_Problem]:
@@ -212,4 +217,4 @@ def _off_surface(e: Episode) -> Iterator[_Problem]:
         )
 
 
-_CHECKS: tuple[Callable[[Episode], Iterator[_Problem]], ...] = (_teleports, _counts, _anchors, _off_surface)
+_CHECKS: tuple[Callable[[Episode], Iterator[_Problem]], ...] = (_times, _teleports, _counts, _anchors, _off_surface)

@@ -5,8 +5,6 @@ from jaxtyping import Bool
 
 from flowlab.records import Episode, Role
 
-STEP_S = 0.0125
-"""Duration of one control step of MetaWorld [s]."""
 MOVING_M = 0.01
 """A query point moves if it ever gets this far from where it was first [m]."""
 
@@ -16,7 +14,7 @@ def caption(episode: Episode, shown: int) -> str:
     T, moves = len(episode), int(moving(episode).sum())
     facts = [
         f"{episode.task}, seed {episode.seed}",
-        f"{T} steps, {T * STEP_S:.2f} s",
+        f"{T} steps, {episode.time_s[-1]:.2f} s",
         f"{int(episode.point_count[0])} cloud points",
         f"{episode.queries.count} query points",
         f"{moves} of them move" + (f" ({shown} shown)" if shown < moves else ""),
@@ -32,7 +30,7 @@ def describe(episode: Episode) -> str:
     rows = {
         "task": episode.task,
         "seed": episode.seed,
-        "frames": f"{len(episode)} ({len(episode) * STEP_S:.2f} s)",
+        "frames": f"{len(episode)} ({episode.time_s[-1]:.2f} s)",
         "success": f"{solved} steps, first at {int(episode.success.argmax())}" if solved else "never",
         "cloud points": " to ".join(map(str, np.unique([episode.point_count.min(), episode.point_count.max()]))),
         "query points": ", ".join(f"{n} {role_name(r)}" for r, n in zip(roles, counts, strict=True)),

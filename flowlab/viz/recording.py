@@ -12,7 +12,7 @@ from jaxtyping import Bool, UInt8
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode
 from flowlab.viz.colours import SERIES_RGB, SUCCESS_RGB, cloud_rgb, cloud_role, role_rgb
-from flowlab.viz.facts import STEP_S, describe
+from flowlab.viz.facts import describe
 from flowlab.viz.layout import CAMERA, DEPTH, RGB, layout, size
 
 TRAIL_STEPS = 20
@@ -59,7 +59,7 @@ def _strict() -> Iterator[None]:
 
 def _times(episode: Episode) -> list[rr.TimeColumn]:
     steps = np.arange(len(episode))
-    return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=steps * STEP_S)]
+    return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=episode.time_s)]
 
 
 def _send_info(recording: rr.RecordingStream, text: str) -> None:

@@ -18,7 +18,7 @@ from matplotlib.typing import ColorType
 from flowlab.geometry.camera import Camera
 from flowlab.records import Episode
 from flowlab.viz.colours import cloud_rgb, cloud_role, role_rgb
-from flowlab.viz.facts import STEP_S, caption, moving, role_name
+from flowlab.viz.facts import caption, moving, role_name
 
 TIME_COLOURS = LinearSegmentedColormap.from_list("time", ["#3b1f8f", "#a3218e", "#e2486a", "#f58a3c", "#f7bf3a"])
 """From the first step to the last: distinct from grey and readable on white."""
@@ -51,7 +51,7 @@ def compose(episode: Episode, title: str) -> Figure:
     _draw_camera_view(figure.add_axes(_BOXES["camera"]), episode)
     _draw_side_view(figure.add_axes(_BOXES["side"]), episode)
     _draw_legend(figure, episode)
-    seconds = Normalize(0, max(len(episode) - 1, 1) * STEP_S)
+    seconds = Normalize(0, max(episode.time_s[-1], 1e-9))
     bar = figure.colorbar(
         ScalarMappable(seconds, TIME_COLOURS), cax=figure.add_axes(_BOXES["bar"]), ticks=MaxNLocator(6)
     )

@@ -1,0 +1,149 @@
+"""Small episodes made by hand: a ball rolls over a plate, and every point lies on one of the two."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowlab.cli import main
+from flowlab.geometry.camera import Camera
+from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
+from flowlab.storage import stats
+from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
+from flowlab.storage.manifest import Manifest, Receipt
+from flowlab.storage.shard import episode_digest, write_shard
+
+ENTITIES = (Entity("plate", "plate", Role.PROP), Entity("ball", "ball", Role.OBJECT))
+LOOKING_DOWN = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, -1, 1], [0, 0, 0, 1]])
+CAMERA = Camera.from_fovy(16, 12, 45.0, LOOKING_DOWN)
+SETTINGS = {"observer": {"points": 64}, "queries": {"points": 8}}
+
+
+def make_episode(
+    seed: int = 0,
+    *,
+    task: str = "roll",
+    steps: int = 12,
+    points: int = 64,
+    queries: int = 8,
+    object_pose: bool = True,
+    depth: bool = False,
+    rgb: bool = False,
+) -> Episode:
+    """The ball (radius 5 cm) rolls 1 cm a step along x and turns with it; the plate lies still at z = 0."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(steps)
+    centre = np.stack([-0.2 + 0.01 * t, np.full(steps, rng.uniform(0.4, 0.6)), np.full(steps, 0.05)], -1)
+    c, s, o, one = np.cos(t / 5), np.sin(t / 5), 0.0 * t, 1 + 0.0 * t
+    turn = np.stack([np.stack([c, o, s], -1), np.stack([o, one, o], -1), np.stack([-s, o, c], -1)], -2)
+    on_ball = points // 2
+    direction = rng.normal(size=(on_ball, 3))
+    ball = 0.05 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    plate = np.append(rng.uniform([-0.4, 0.2], [0.4, 0.8], (points - on_ball, 2)), np.zeros((points - on_ball, 1)), 1)
+    moved = np.einsum("tij,mj->tmi", turn, ball) + centre[:, None]
+    cloud = np.concatenate([moved, np.broadcast_to(plate, (steps, *plate.shape))], 1).astype(np.float32)
+    chosen = rng.integers(0, points, queries)
+    tracks = cloud[:, chosen]
+    return Episode(
+        task=task,
+        seed=seed,
+        camera=CAMERA,
+        time_s=t / 80,
+        point_cloud=cloud,
+        point_count=np.full(steps, points, np.int32),
+        state=rng.normal(size=(steps, 9)).astype(np.float32),
+        action=rng.uniform(-1, 1, (steps, 4)).astype(np.float32),
+        success=t >= steps - 5,
+        queries=Queries(tracks[0], (chosen < on_ball).astype(np.int16), queries, ENTITIES),
+        tracks=Tracks3D(tracks, rng.random((steps, queries)) < 0.9, np.zeros(queries, np.float32)),
+        object_pose=np.concatenate([centre, turn[..., 0], turn[..., 1]], -1).astype(np.float32)
+        if object_pose
+        else None,
+        depth=rng.uniform(0.5, 1, (steps, 12, 16)).astype(np.float32) if depth else None,
+        rgb=rng.integers(0, 256, (steps, 12, 16, 3)).astype(np.uint8) if rgb else None,
+        extras={"rand_vec": rng.normal(size=3).tolist()},
+    )
+
+
+def make_receipt(episodes: Sequence[Episode], **changes: Any) -> Receipt:
+    """The receipt of a unit that made these episodes of one task."""
+    first, last = episodes[0], episodes[-1]
+    values: dict[str, Any] = {
+        "unit": f"{first.task}-{first.seed:06d}-{last.seed:06d}",
+        "task": first.task,
+        "seeds": tuple(e.seed for e in episodes),
+        "accepted": tuple(e.seed for e in episodes),
+        "frames": tuple(len(e) for e in episodes),
+        "digests": tuple(episode_digest(e) for e in episodes),
+        "stats": stats.summarise(episodes),
+    }
+    return Receipt(**{**values, **changes})
+
+
+def make_manifest(requested: dict[str, int], **changes: Any) -> Manifest:
+    values: dict[str, Any] = {
+        "recipe": "by-hand",
+        "settings": SETTINGS,
+        "camera": CAMERA.to_json(),
+        "world_frame": "z up",
+        "first_seed": 0,
+        "requested": requested,
+    }
+    return Manifest(**{**values, **changes})
+
+
+def make_dataset(folder: Path, units: Iterable[Sequence[Episode]], **changes: Any) -> Dataset:
+    """A complete dataset with one shard for each group of episodes."""
+    units = list(units)
+    requested: dict[str, int] = {}
+    for unit in units:
+        requested[unit[0].task] = requested.get(unit[0].task, 0) + len(unit)
+    manifest = begin(folder, make_manifest(requested, **changes))
+    for unit in units:
+        receipt = make_receipt(unit)
+        write_shard(folder / receipt.shard, unit, manifest.settings_digest)
+        keep_receipt(folder, receipt)
+    return summarise(folder)
+
+
+def assert_same(a: Any, b: Any, where: str = "episode") -> None:
+    """Two records are the same to the last bit, types and shapes included."""
+    assert type(a) is type(b), f"{where}: {type(a)} and {type(b)}"
+    if isinstance(a, np.ndarray):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), where
+        assert a.tobytes() == b.tobytes(), f"{where} differs"
+    elif is_dataclass(a):
+        for field in fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    else:
+        assert a == b, where
+
+
+def files_below(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Content and time of change of every file."""
+    return {
+        str(f.relative_to(folder)): (f.read_bytes(), f.stat().st_mtime_ns) for f in folder.rglob("*") if f.is_file()
+    }
+
+
+def with_tracks(episode: Episode, xyz_world: np.ndarray) -> Episode:
+    """The episode with other tracks, its queries where they start."""
+    return replace(
+        episode,
+        tracks=replace(episode.tracks, xyz_world=xyz_world),
+        queries=replace(episode.queries, xyz_world=xyz_world[0]),
+    )
+
+
+def call_cli(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
+    """Exit code, output and error output of the command line, run here: quick, and any traceback is a failure."""
+    capsys.readouterr()
+    code: Any = 0
+    try:
+        main(*map(str, arguments))
+    except SystemExit as end:
+        code = end.code
+    return code, *capsys.readouterr()
