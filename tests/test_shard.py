@@ -21,7 +21,8 @@ from synthetic import CAMERA, assert_same, make_episode
 
 from flowlab.errors import DataError
 from flowlab.records import Entity, Episode, Role
-from flowlab.storage.shard import STEPS_PER_CHUNK, Shard, episode_digest, remove_leftovers, write_shard
+from flowlab.storage.files import remove_leftovers
+from flowlab.storage.shard import STEPS_PER_CHUNK, Shard, episode_digest, write_shard
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])}
 ARRAYS = {

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Cli
 from matplotlib.image import imread
 from rerun.chunk import RrdReader
 
@@ -266,3 +267,14 @@ def test_one_frame_is_enough(episode: Episode, tmp_path: Path) -> None:
     one = replace(episode, tracks=tracks, **{name: getattr(episode, name)[:1] for name in names})
     assert recorded(one, tmp_path)["/world/tracks/points", "step"] == [0]
     assert picture(one, tmp_path / "e.png").shape == (960, 1800, 3)
+
+
+@pytest.mark.parametrize("option", ["--png", "--save"])
+def test_a_place_that_cannot_be_written_is_one_sentence(
+    option: str, flowlab: Cli, small_dataset: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    result = flowlab("viz", small_dataset, option, tmp_path / "file" / "picture")
+    assert result.returncode == 1
+    assert "file/picture: cannot be written" in result.stderr
+    assert "Traceback" not in result.stderr

@@ -1,5 +1,7 @@
 """``flowlab viz``."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -31,12 +33,24 @@ def viz(dataset: Path, episode: int, task: str | None, save: Path | None, png: P
     if png is not None:
         from flowlab.viz.still import draw_still
 
-        draw_still(shown, png, title=name)
+        with _writing(png):
+            draw_still(shown, png, title=name)
         click.echo(f"{name}: {png}")
     if save is not None or png is None:
         from flowlab.viz.recording import write_recording
 
         save = save or Path(f"{shown.task}-{shown.seed:06d}.rrd")
         about = f"dataset {dataset}, fingerprint {data.fingerprint}, recipe {data.manifest.recipe}"
-        write_recording(shown, save, name=name, about=about)
+        with _writing(save):
+            write_recording(shown, save, name=name, about=about)
         click.echo(f"{name}: {save}; open it with: rerun {save}")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    from flowlab.errors import FlowlabError
+
+    try:
+        yield
+    except OSError as error:
+        raise FlowlabError(f"{path}: cannot be written ({error.strerror}); choose another file") from error

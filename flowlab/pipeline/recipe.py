@@ -114,7 +114,7 @@ def _import_stage(name: str) -> type[Stage]:
     module, _, attribute = name.partition(":")
     try:
         cls = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # whatever somebody's module does
         raise UsageError(f"stage '{name}': cannot be imported ({error})") from error
     if not (isinstance(cls, type) and issubclass(cls, Stage)):
         raise UsageError(f"stage '{name}': is not a subclass of flowlab.pipeline.stage.Stage")

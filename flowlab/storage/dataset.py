@@ -12,9 +12,9 @@ from flowlab.errors import DataError
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
-from flowlab.storage.files import write_json, write_whole
+from flowlab.storage.files import remove_leftovers, write_json, write_whole
 from flowlab.storage.manifest import MANIFEST, Manifest, Receipt, differences, read_receipts
-from flowlab.storage.shard import Shard, remove_leftovers
+from flowlab.storage.shard import Shard
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,8 @@ def begin(folder: Path, manifest: Manifest) -> Manifest:
         requested = {t: max(n, manifest.requested.get(t, 0)) for t, n in old.requested.items()}
         manifest = old.model_copy(update={"requested": {**manifest.requested, **requested}})
     write_json(folder / MANIFEST, json.loads(manifest.model_dump_json()))
-    remove_leftovers(folder / "shards")
+    for place in (folder, folder / "shards", folder / "receipts"):
+        remove_leftovers(place)
     return manifest
 
 

@@ -1,16 +1,48 @@
-"""Small files that are either there and whole, or not there."""
+"""Files that are either there and whole, or not there."""
 
 import json
 import os
+import shutil
+import socket
 from pathlib import Path
 from typing import Any
 
 from flowlab.errors import DataError
 
 
+def temporary_path(path: Path) -> Path:
+    """Where this process makes what will be renamed to ``path``."""
+    return path.with_name(f"{_prefix()}{os.getpid()}+{path.name}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what processes of this machine that no longer run were making in a folder."""
+    for leftover in folder.glob(f"{_prefix()}*"):
+        if _runs(int(leftover.name.removeprefix(_prefix()).partition("+")[0])):
+            continue
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)
+
+
+def _prefix() -> str:
+    return f".tmp-{socket.gethostname()}+"  # no machine's name has a plus sign
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
 def write_whole(path: Path, text: str) -> None:
     """Replace a file in one step."""
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    temporary = temporary_path(path)
     try:
         temporary.write_text(text)
         os.replace(temporary, path)

@@ -2,9 +2,9 @@
 
 import errno
 import hashlib
+import json
 import os
 import shutil
-import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +18,7 @@ from zarr.storage import MemoryStore
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
+from flowlab.storage.files import temporary_path
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION, ArraySpec
 
 STEPS_PER_CHUNK = 256
@@ -32,7 +33,7 @@ def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str) -
     """
     files = _encode(episodes, settings_digest)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_temporary_prefix()}{os.getpid()}+{path.name}")
+    temporary = temporary_path(path)
     try:
         for name, content in files.items():
             file = temporary / name
@@ -64,20 +65,13 @@ def _replace(path: Path, whole: Path) -> None:
 
 def episode_digest(episode: Episode) -> str:
     """SHA-256 of everything stored of an episode, whatever shard it lies in."""
-    digest = hashlib.sha256(f"{episode.task} {episode.camera.to_json()} {dict(episode.extras)}".encode())
+    about = [episode.task, episode.camera.to_json(), _entities_to_json(episode), dict(episode.extras)]
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for spec in SCHEMA:
         values = spec.of(episode)
         if values is not None:
             digest.update(f"{spec.path} {values.shape}".encode() + np.ascontiguousarray(values, spec.dtype).tobytes())
     return digest.hexdigest()
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Delete temporary shards of processes of this machine that no longer run."""
-    for leftover in folder.glob(f"{_temporary_prefix()}*"):
-        pid = int(leftover.name.removeprefix(_temporary_prefix()).partition("+")[0])
-        if not _runs(pid):
-            shutil.rmtree(leftover, ignore_errors=True)
 
 
 class Shard:
@@ -188,6 +182,10 @@ class Shard:
 _REDO = "delete the unit's receipt and run the same extract command again to make it anew"
 
 
+def _entities_to_json(episode: Episode) -> list[list[str]]:
+    return [[e.geom, e.body, e.role.name.lower()] for e in episode.queries.entities]
+
+
 _SHARED: dict[str, Callable[[Episode], object]] = {
     "camera": lambda e: e.camera.to_json(),
     "entities": lambda e: e.queries.entities,
@@ -210,7 +208,7 @@ def _encode(episodes: Sequence[Episode], settings_digest: str) -> dict[str, byte
             "flowlab_schema": SCHEMA_VERSION,
             "settings_digest": settings_digest,
             "camera": first.camera.to_json(),
-            "entities": [[e.geom, e.body, e.role.name.lower()] for e in first.queries.entities],
+            "entities": _entities_to_json(first),
             "episodes": [{"task": e.task, "extras": dict(e.extras)} for e in episodes],
         },
     )
@@ -233,20 +231,6 @@ def _write(group: zarr.Group, path: str, values: np.ndarray, dims: tuple[str, ..
         attributes={"unit": unit, "meaning": meaning},
         config={"write_empty_chunks": True},  # so that a missing chunk always means damage
     )
-
-
-def _temporary_prefix() -> str:
-    return f".tmp-{socket.gethostname()}+"  # no machine's name has a plus sign
-
-
-def _runs(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _first_line(error: BaseException) -> str:
