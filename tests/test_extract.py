@@ -138,23 +138,5 @@ def test_shards_of_a_job_array_fill_one_dataset_together(flowlab: Cli, small_dat
     assert content(out) == content(small_dataset)
 
 
-def test_more_episodes_extend_a_dataset(flowlab: Cli, small_dataset: Path, tmp_path: Path) -> None:
-    out = tmp_path / "extended"
-    shutil.copytree(small_dataset, out)
-    before = {k: v for k, v in content(out).items() if k.startswith("shards/")}
-    assert flowlab("extract-sim", "drawer-open", "--episodes", 4, "--out", out).returncode == 0
-    assert content(out).items() >= before.items(), "what was there is not touched"
-    assert [r.seed for r in Dataset(out).refs if r.task == "drawer-open"] == [0, 1, 2, 3]
-    assert flowlab("validate", out).returncode == 0
-
-
-def test_a_dry_run_writes_nothing(flowlab: Cli, tmp_path: Path) -> None:
-    result = flowlab("extract-sim", "drawer-open", "--out", tmp_path / "never", "--dry-run", "--json")
-    plan = json.loads(result.stdout)
-    assert plan["episodes_to_do"] == 10
-    assert plan["estimated_minutes"] > 0
-    assert not (tmp_path / "never").exists()
-
-
 def test_a_worker_stays_below_400_mb(small_dataset: Path) -> None:
     assert 100 < max(r.peak_memory_mb for r in Dataset(small_dataset).receipts) < 400

@@ -2,6 +2,7 @@
 
 import errno
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -30,12 +31,11 @@ _SECONDS_BETWEEN_SUMMARIES = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run is: episodes accepted of those wanted, and the receipt that just came in."""
+    """How far a run is: episodes accepted of those wanted, and seeds rejected on the way."""
 
     accepted: int
     wanted: int
     rejected: int
-    latest: Receipt | None = None
 
 
 def manifest_for(recipe: Recipe, tasks: tuple[str, ...]) -> Manifest:
@@ -111,10 +111,8 @@ def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int)
             f"{request.task} seed {request.seed} is rejected at {stage} ({reason}): no estimate"
         ) from rejected
     seconds = time.process_time() - start
-    have = {r.task: 0 for r in read_receipts(folder)}
-    for receipt in read_receipts(folder):
-        have[receipt.task] += len(receipt.accepted)
-    todo = sum(max(recipe.episodes - have.get(t, 0), 0) for t in tasks)
+    have = Counter(task for r in read_receipts(folder) for task in [r.task] * len(r.accepted))
+    todo = sum(max(recipe.episodes - have[t], 0) for t in tasks)
     frame_bytes = sum(v.nbytes for s in SCHEMA if s.per_step and (v := s.of(episode)) is not None)
     return {
         "tasks": len(tasks),
@@ -141,14 +139,13 @@ def _run_all(
     receipts = _receipts_by_unit(folder)
     under_way: dict[str, WorkUnit] = {}
     failures: list[Outcome] = []
-    latest, next_summary = None, time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
+    next_summary = time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
     while True:
-        for unit in _plan(
-            wanted, first_seed, receipts.values(), [*under_way.values(), *(f.unit for f in failures)], share
-        ):
+        taken = [*under_way.values(), *(f.unit for f in failures)]
+        for unit in _plan(wanted, first_seed, receipts.values(), taken, share):
             under_way[unit.name] = unit
             engine.submit(unit)
-        report(_progress(wanted, receipts.values(), latest))
+        report(_progress(wanted, receipts.values()))
         if not under_way:
             seen, receipts = receipts.keys(), _receipts_by_unit(folder)
             if receipts.keys() == seen:  # otherwise jobs beside this one went on: is there more to do now?
@@ -156,7 +153,6 @@ def _run_all(
             continue
         outcome = engine.next_outcome()
         del under_way[outcome.unit.name]
-        latest = outcome.receipt
         if outcome.receipt is None:
             failures.append(outcome)
         else:
@@ -184,13 +180,13 @@ def _plan(
         yield from next_units(task, episodes, first_seed, tried[task], sure[task], share)
 
 
-def _progress(wanted: Mapping[str, int], receipts: Iterable[Receipt], latest: Receipt | None) -> Progress:
+def _progress(wanted: Mapping[str, int], receipts: Iterable[Receipt]) -> Progress:
     accepted, rejected = dict.fromkeys(wanted, 0), 0
     for receipt in receipts:
         if receipt.task in wanted:
             accepted[receipt.task] += len(receipt.accepted)
             rejected += len(receipt.rejects)
-    return Progress(sum(min(accepted[t], n) for t, n in wanted.items()), sum(wanted.values()), rejected, latest)
+    return Progress(sum(min(accepted[t], n) for t, n in wanted.items()), sum(wanted.values()), rejected)
 
 
 def _receipts_by_unit(folder: Path) -> dict[str, Receipt]:

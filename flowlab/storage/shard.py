@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import EllipsisType
 from typing import Any
 
 import numpy as np
@@ -91,15 +92,15 @@ class Shard:
     def __len__(self) -> int:
         return len(self.attributes["episodes"])
 
-    def array(self, spec_path: str) -> np.ndarray:
-        """A whole array; a missing or damaged chunk is an error, never silent zeros."""
+    def array(self, spec_path: str, rows: slice | int | EllipsisType = ...) -> np.ndarray:
+        """An array, or some rows of it; a missing or damaged chunk is an error, never silent zeros."""
         place = f"{self.path}/{spec_path}"
         array = self._open(spec_path)
         missing = array.nchunks - array.nchunks_initialized
         if missing:
             raise DataError(f"{place}: {missing} of {array.nchunks} chunks missing; {_REDO}")
         try:
-            return np.asarray(array[...])
+            return np.asarray(array[rows])
         except (ValueError, RuntimeError, OSError) as error:
             raise DataError(f"{place}: damaged ({_first_line(error)}); {_REDO}") from error
 
@@ -152,7 +153,7 @@ class Shard:
         columns = {}
         for spec in SCHEMA:
             if self.has(spec) or not spec.optional:
-                columns[spec.path] = self.array(spec.path)[rows if spec.per_step else k]
+                columns[spec.path] = self.array(spec.path, rows if spec.per_step else k)
         return self._episode(k, columns)
 
     def _episode(self, k: int, columns: Mapping[str, np.ndarray]) -> Episode:
