@@ -16,6 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from flowlab.errors import FlowlabError
 from flowlab.pipeline.units import WorkUnit
+from flowlab.storage.files import is_running
 from flowlab.storage.manifest import Receipt
 
 _WORKER_ENVIRONMENT = (
@@ -67,8 +68,11 @@ class LocalEngine:
     def __enter__(self) -> Self:
         for name in _WORKER_ENVIRONMENT:
             os.environ.setdefault(name, "1")
+        # Workers are forked from a clean process that has imported everything once, and share its memory.
+        context = get_context("forkserver")
+        context.set_forkserver_preload(["flowlab.pipeline.worker"])
         self._pool = ProcessPool(
-            max_workers=self._workers, context=get_context("spawn"), initializer=_start_worker, initargs=[os.getpid()]
+            max_workers=self._workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )
         return self
 
@@ -102,12 +106,12 @@ class LocalEngine:
         self._tries[self._pool.schedule(self._work, args=[unit])] = unit, tries
 
 
-def _start_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and do not outlive it."""
+def _start_worker(program: int) -> None:
+    """Leave Ctrl-C to the program, and end with it, however it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
-        while os.getppid() == parent:
+        while is_running(program):
             time.sleep(1.0)
         os._exit(1)
 

@@ -18,7 +18,7 @@ def temporary_path(path: Path) -> Path:
 def remove_leftovers(folder: Path) -> None:
     """Delete what processes of this machine that no longer run were making in a folder."""
     for leftover in folder.glob(f"{_prefix()}*"):
-        if _runs(int(leftover.name.removeprefix(_prefix()).partition("+")[0])):
+        if is_running(int(leftover.name.removeprefix(_prefix()).partition("+")[0])):
             continue
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
@@ -30,7 +30,8 @@ def _prefix() -> str:
     return f".tmp-{socket.gethostname()}+"  # no machine's name has a plus sign
 
 
-def _runs(pid: int) -> bool:
+def is_running(pid: int) -> bool:
+    """Whether a process of this machine runs."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
