@@ -73,9 +73,12 @@ def extract(
     Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
     the dataset is whole in either case.
     """
-    manifest = begin(folder, manifest_for(recipe, tasks))
     log = folder / "failures.log"
-    log.unlink(missing_ok=True)
+    try:
+        manifest = begin(folder, manifest_for(recipe, tasks))
+        log.unlink(missing_ok=True)
+    except OSError as error:
+        raise _storage_error(folder, error) from error
     work = partial(run_unit, recipe.model_dump_json(), manifest.settings_digest, folder)
     try:
         with start_engine(work) as engine:

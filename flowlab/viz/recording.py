@@ -11,6 +11,7 @@ from jaxtyping import Bool, UInt8
 
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode
+from flowlab.storage.files import temporary_path
 from flowlab.viz.colours import SERIES_RGB, SUCCESS_RGB, cloud_rgb, cloud_role, role_rgb
 from flowlab.viz.facts import describe
 from flowlab.viz.layout import CAMERA, DEPTH, RGB, layout, size
@@ -30,7 +31,7 @@ def write_recording(episode: Episode, path: Path, *, name: str, about: str = "")
     All positions are metres in the world frame of the episode.
     """
     recording = rr.RecordingStream("flowlab")
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with _strict():

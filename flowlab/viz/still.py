@@ -17,6 +17,7 @@ from matplotlib.typing import ColorType
 
 from flowlab.geometry.camera import Camera
 from flowlab.records import Episode
+from flowlab.storage.files import temporary_path
 from flowlab.viz.colours import cloud_rgb, cloud_role, role_rgb
 from flowlab.viz.facts import caption, moving, role_name
 
@@ -34,7 +35,7 @@ _BOXES = {"camera": (_LEFT, 0.145, 0.43, 0.70), "side": (0.525, 0.145, 0.40, 0.7
 
 def draw_still(episode: Episode, path: Path, *, title: str) -> None:
     """Write a PNG of 1800 x 960 pixels. ``path`` is either absent, as before, or whole."""
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         compose(episode, title).savefig(temporary, format="png", facecolor="white")
