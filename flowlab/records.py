@@ -1,6 +1,6 @@
 """The records that travel between stages: small, frozen, each made in one place.
 
-    Frame -> Cloud -> Observation -> Queries -> Tracks3D -> Episode -> shard
+    Frame -> Cloud -> Observation -> Queries -> Tracks2D (real only) -> Tracks3D -> Episode -> shard
 
 A real recording and a simulated rollout are both a :class:`Demonstration`; they differ only in how
 tracks are made. World coordinates are metres in the dataset's world frame, which ``docs/conventions.md``
@@ -90,6 +90,70 @@ class Queries:
 
 
 @dataclass(frozen=True, slots=True)
+class Clip:
+    """A whole demonstration as one camera saw it: what a tracker works on."""
+
+    rgb: UInt8[np.ndarray, "T H W 3"]
+    depth: Float32[np.ndarray, "T H W"]
+    """z-depth [m], registered to the colour picture; 0 where there is no reading."""
+    camera: Camera
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks2D:
+    """Where a tracker says every query point is in the picture."""
+
+    xy: Float32[np.ndarray, "T M 2"]
+    """Pixel (x right, y down), integer pixel centres; always finite, a held position where the point is lost."""
+    visible: Bool[np.ndarray, "T M"]
+    """Whether the tracker believes that the camera sees the point there."""
+    confidence: Float32[np.ndarray, "T M"]
+    """The tracker's own belief in the position, 0 to 1."""
+    forward_backward: Float32[np.ndarray, "T M"] | None = None
+    """How far a point lands from its start when tracked there and back [px]; -1 where not measured."""
+    disagreement: Float32[np.ndarray, "T M"] | None = None
+    """How far apart overlapping chunks put the point [px]; -1 where only one chunk covers it."""
+    depth: Float32[np.ndarray, "T M"] | None = None
+    """z-depth [m] where a model of the motion gives it, for points out of sight too; 0 where none does."""
+    residual: Float32[np.ndarray, "T M"] | None = None
+    """How badly that model explains colour and depth around the point, 0 to 1; -1 where none does."""
+
+
+class Source(IntEnum):
+    """Where the position of a tracked point comes from, at one instant."""
+
+    SIMULATOR = 0
+    """Exact: a simulated body carries it."""
+    MEASURED = 1
+    """Followed in the picture, and its depth read there by the sensor."""
+    MODEL = 2
+    """Carried by a rigid motion that was fitted to the pictures; so may a point out of sight be."""
+    FILLED = 3
+    """Neither: interpolated between instants at which it was known, or held at the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """What is known of the error of tracks that were estimated from pictures."""
+
+    sigma: Float32[np.ndarray, "T M"]
+    """Stated error [m]: 68 % of errors are meant to be below it."""
+    source: UInt8[np.ndarray, "T M"]
+    """The :class:`Source` of every position."""
+    depth_valid: Bool[np.ndarray, "T M"]
+    """Whether the sensor gave a depth at the point's pixel that fits the point."""
+    forward_backward: Float32[np.ndarray, "T M"]
+    """See :class:`Tracks2D`."""
+    disagreement: Float32[np.ndarray, "T M"]
+    """See :class:`Tracks2D`."""
+    residual: Float32[np.ndarray, "T M"]
+    """See :class:`Tracks2D`."""
+
+
+@dataclass(frozen=True, slots=True)
 class Tracks3D:
     """Where every query point is at every instant."""
 
@@ -98,6 +162,8 @@ class Tracks3D:
     visible: Bool[np.ndarray, "T M"]
     association_distance: Float32[np.ndarray, "M"]
     """How far from its query the followed point lies at the first frame [m]; 0 for exact tracks."""
+    quality: Quality | None = None
+    """None for exact tracks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,6 +212,16 @@ class QueriedDemo:
 
     observed: ObservedDemo
     queries: Queries
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedDemo:
+    """A demonstration whose query points have been followed in the picture."""
+
+    queried: QueriedDemo
+    tracks: Tracks2D
+    tracker: Mapping[str, Any]
+    """Name, licence and version of the tracker, and what weights it used."""
 
 
 @dataclass(frozen=True, slots=True)

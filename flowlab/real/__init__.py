@@ -1,0 +1,1 @@
+"""Recordings of real robots: readers of the layouts people have, on one time axis and in one camera."""
