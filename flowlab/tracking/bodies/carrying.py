@@ -1,0 +1,81 @@
+"""Where query points go: each with the motion that explains it and its surroundings best."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from flowlab.tracking.bodies import _kernels
+from flowlab.tracking.bodies.fit import Fit
+from flowlab.tracking.bodies.labels import point_costs
+from flowlab.tracking.bodies.segments import STEP
+
+_OWN = 0.7
+"""Weight of a point's own cost against one cell's that looks exactly like it."""
+
+_ALMOST = 0.06
+"""A cost this much higher explains a point almost as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """Queries carried by a fit."""
+
+    xyz_cam: Float64[np.ndarray, "T M 3"]
+    visible: Bool[np.ndarray, "T M"]
+    motion: Int64[np.ndarray, "M"]
+    """Index of each query's motion."""
+    cost: Float32[np.ndarray, "M"]
+    """How badly that explains the point; 0 is perfect, 1 is nothing like it."""
+    spread: Float64[np.ndarray, "T M"]
+    """How far [m] the motions that explain the point almost as well would put it from there."""
+    residual: Float32[np.ndarray, "T M"]
+    """How badly colour and depth fit at that very frame, 0 to 1; where the point is hidden, its cost."""
+
+
+def carry(fit: Fit, uv: np.ndarray, z: np.ndarray) -> Carried:
+    """Carry points at pixels (M, 2) and depths (M,) [m] of the first frame through the clip."""
+    xyz = fit.pictures.unproject(uv.astype(float), z.astype(float))
+    cost = _surrounded(fit, uv, z, point_costs(fit.pictures, fit.motions, uv, xyz))
+    motion = cost.argmin(0)
+    every = np.stack([m.carry(xyz) for m in fit.motions])
+    path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
+    seen, least = _seen(fit, path), cost.min(0)
+    belief = np.exp(-(cost - least) / _ALMOST)
+    belief /= belief.sum(0)
+    spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
+    return Carried(path, seen, motion, least, spread, _residual(fit, uv, path, seen, least))
+
+
+def _residual(fit: Fit, uv: np.ndarray, path: np.ndarray, seen: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    features = _kernels.features_at(fit.pictures.feature[0], uv.astype(np.float32))
+    p = fit.pictures
+    now = _kernels.misfit(p.depth, p.feature, features, p.project(path), path[..., 2])
+    return np.where(seen & (now >= 0), now, cost.clip(0, 1)).astype(np.float32)
+
+
+def _surrounded(fit: Fit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """The points' own costs (B, M) averaged with those of the cells around that are as deep and coloured alike."""
+    grid, height, width = fit.grid, *fit.grid.valid.shape
+    features = _kernels.features_at(fit.pictures.feature[0], uv.astype(np.float32))[:, 1:]
+    cell_features = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
+    i, j = np.rint(uv[:, 1] / STEP).astype(int), np.rint(uv[:, 0] / STEP).astype(int)
+    total, weights = _OWN * own, np.full(len(uv), _OWN)
+    scale = np.array([_kernels.L, _kernels.A, _kernels.B])
+    for y in range(-3, 4):
+        for x in range(-3, 4):
+            a, b = np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)
+            far = np.abs(grid.depth[a, b] - z) / (0.01 * np.maximum(1, z))
+            colour = (np.abs(cell_features[a, b] - features) * scale).sum(1)
+            w = grid.valid[a, b] * np.exp(-np.minimum(far, 20) - colour / 0.35 - (x * x + y * y) / 8)
+            total = total + w * fit.labels.raw[:, a, b]
+            weights = weights + w
+    return (total / weights).astype(np.float32)
+
+
+def _seen(fit: Fit, path: np.ndarray) -> np.ndarray:
+    """Whether the depth pictures show the points (T, M, 3) where they are."""
+    uv = fit.pictures.project(path)
+    height, width = fit.pictures.depth.shape[1:]
+    inside = ((uv > -0.5) & (uv < [width - 0.5, height - 0.5])).all(-1) & (path[..., 2] > 0)
+    return inside & _kernels.shown(fit.pictures.depth, uv, path[..., 2])
