@@ -10,7 +10,7 @@ import pytest
 
 from flowlab.cli import main
 from flowlab.geometry.camera import Camera
-from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
+from flowlab.records import Entity, Episode, Quality, Queries, Role, Source, Tracks3D
 from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
 from flowlab.storage.manifest import Manifest, Receipt
@@ -147,3 +147,68 @@ def call_cli(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tupl
     except SystemExit as end:
         code = end.code
     return code, *capsys.readouterr()
+
+
+def with_quality(episode: Episode, seed: int = 0) -> Episode:
+    """The episode as if its tracks had been estimated: measured where visible, else modelled or filled."""
+    rng = np.random.default_rng(seed)
+    visible = episode.tracks.visible
+    shape = visible.shape
+    hidden = rng.choice([Source.MODEL, Source.FILLED], shape)
+    quality = Quality(
+        sigma=rng.uniform(0.001, 0.02, shape).astype(np.float32),
+        source=np.where(visible, Source.MEASURED, hidden).astype(np.uint8),
+        depth_valid=visible | (rng.random(shape) < 0.1),
+        forward_backward=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 2, shape)).astype(np.float32),
+        disagreement=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 2, shape)).astype(np.float32),
+        residual=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 1, shape)).astype(np.float32),
+    )
+    return replace(episode, tracks=replace(episode.tracks, quality=quality))
+
+
+LOOKING_ALONG_Y = np.array([[1.0, 0, 0, 0], [0, 0, 1, -1], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def make_filmed_episode(T_world_cam: np.ndarray | None = None, *, steps: int = 12, seed: int = 3) -> Episode:
+    """As if from a recording: roles are not known, and without a pose the world is the camera's frame.
+
+    Before a grey wall 1 m away, by point: 0 is sure and goes right by a pixel a step, 1 is unsure and goes
+    down, 2 was filled in, 3 is out of sight, 4 is behind the camera, and 5 repeats 4 wherever padding may lie.
+    """
+    camera = Camera.from_fovy(80, 60, 50.0, np.eye(4) if T_world_cam is None else T_world_cam)
+    t = np.arange(steps)
+    uv = np.broadcast_to([[20.0, 12], [60, 10], [30, 40], [50, 45], [40, 30], [70, 52]], (steps, 6, 2)).copy()
+    uv[:, 0, 0] += t
+    uv[:, 1, 1] += t
+    z = np.broadcast_to([1.0, 1, 1, 1, -1, 1], (steps, 6))
+    tracks = camera.unproject(uv, z).astype(np.float32)
+    visible = np.tile([True, True, False, False, False, True], (steps, 1))
+    source = [Source.MEASURED, Source.MEASURED, Source.FILLED, Source.MODEL, Source.MODEL, Source.MEASURED]
+    unmeasured = np.full((steps, 6), -1, np.float32)
+    quality = Quality(
+        sigma=np.tile(np.array([0.001, 0.06, 0.02, 0.02, 0.02, 0], np.float32), (steps, 1)),
+        source=np.tile(np.array(source, np.uint8), (steps, 1)),
+        depth_valid=visible,
+        forward_backward=unmeasured,
+        disagreement=unmeasured,
+        residual=unmeasured,
+    )
+    v, u = np.mgrid[2:60:8, 2:80:8].reshape(2, -1)
+    wall = camera.unproject(np.stack([u, v], -1), np.ones(len(u))).astype(np.float32)
+    rgb = np.full((steps, 60, 80, 3), 128, np.uint8)
+    return Episode(
+        task="pour",
+        seed=seed,
+        camera=camera,
+        time_s=t / 10,
+        point_cloud=np.broadcast_to(wall, (steps, *wall.shape)).copy(),
+        point_count=np.full(steps, len(wall), np.int32),
+        state=np.zeros((steps, 7), np.float32),
+        action=np.zeros((steps, 8), np.float32),
+        success=t == steps - 1,
+        queries=Queries(tracks[0], np.full(6, -1, np.int16), 5),
+        tracks=Tracks3D(tracks, visible, np.zeros(6, np.float32), quality),
+        depth=np.ones((steps, 60, 80), np.float32),
+        rgb=rgb,
+        extras={"source": "pour-3", "tracker": {"tracker": "bodies", "licence": "Apache-2.0", "options": {}}},
+    )

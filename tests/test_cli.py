@@ -17,8 +17,8 @@ from synthetic import call_cli, make_manifest
 import flowlab as package
 from flowlab.storage.dataset import Dataset, begin
 
-COMMANDS = ["tasks", "extract-sim", "info", "validate", "viz", "export"]
-HEAVY = ["numpy", "zarr", "mujoco", "rerun", "numba", "scipy", "matplotlib", "metaworld", "jaxtyping"]
+COMMANDS = ["tasks", "extract-sim", "track-real", "grade", "info", "validate", "viz", "export"]
+HEAVY = ["numpy", "zarr", "mujoco", "rerun", "numba", "scipy", "matplotlib", "metaworld", "jaxtyping", "cv2", "torch"]
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["no-such-command"], ["validate", "--help"]])

@@ -3,17 +3,20 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from conftest import Cli
-from synthetic import assert_same, files_below, make_dataset, make_episode, make_manifest
+from synthetic import assert_same, files_below, make_dataset, make_episode, make_manifest, make_receipt, with_quality
 
 from flowlab.errors import DataError
-from flowlab.storage.dataset import Dataset, begin, keep_receipt
-from flowlab.storage.manifest import MANIFEST, Receipt, StageTally
-from flowlab.storage.shard import Shard
+from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
+from flowlab.storage.manifest import MANIFEST, Receipt, Reject, StageTally
+from flowlab.storage.recorded import Recorded
+from flowlab.storage.shard import Shard, write_shard
 
 EPISODES = [make_episode(k, task=task, steps=6 + k) for task in ("roll", "push") for k in range(3)]
 
@@ -207,3 +210,97 @@ def test_receipts_half_written_by_another_job_are_passed_over(tmp_path: Path) ->
 def test_receipts_survive_their_json(small_dataset: Path) -> None:
     for receipt in Dataset(small_dataset).receipts:
         assert Receipt.model_validate_json(receipt.model_dump_json()) == receipt
+
+
+def recorded(*names: str, task: str = "roll") -> tuple[Recorded, ...]:
+    return tuple(Recorded(task=task, name=n, source=f"/rec/{n}") for n in names)
+
+
+def test_recordings_are_missing_until_they_have_a_receipt(tmp_path: Path) -> None:
+    """Whether it says accepted or rejected."""
+    begin(tmp_path, make_manifest({}, recordings=recorded("a", "b", "c")))
+    assert Dataset(tmp_path).manifest.requested == {"roll": 3}
+    assert Dataset(tmp_path).missing == {"roll": 3}
+    nothing = {"unit": "roll-000001", "accepted": (), "frames": (), "digests": (), "stats": {}}
+    keep_receipt(tmp_path, make_receipt([make_episode(0)]))
+    keep_receipt(tmp_path, make_receipt([make_episode(1)], **nothing))
+    assert Dataset(tmp_path).missing == {"roll": 1}
+
+
+def test_beginning_again_adds_recordings_and_keeps_the_others(tmp_path: Path) -> None:
+    begin(tmp_path, make_manifest({}, recordings=recorded("b", "c")))
+    manifest = begin(tmp_path, make_manifest({}, recordings=recorded("c", "a") + recorded("z", task="push")))
+    assert [(r.task, r.name, r.seed) for r in manifest.recordings] == [
+        ("roll", "b", 0), ("roll", "c", 1), ("push", "z", 2), ("roll", "a", 3),
+    ]  # fmt: skip
+    assert manifest.requested == {"roll": 3, "push": 1}
+    assert Dataset(tmp_path).manifest == manifest
+
+
+BEGINS = """
+import sys, time
+from pathlib import Path
+from synthetic import make_manifest
+import flowlab.storage.dataset as dataset
+from flowlab.storage.recorded import Recorded
+
+at_once = dataset.write_json
+dataset.write_json = lambda *a: (time.sleep(0.3), at_once(*a))  # so that the others come in between
+name = sys.argv[2]
+print(flush=True)
+sys.stdin.read()
+dataset.begin(Path(sys.argv[1]), make_manifest({}, recordings=[Recorded(task="roll", name=name, source=name)]))
+"""
+
+
+def test_jobs_that_begin_together_number_their_recordings_apart(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "env": {**os.environ, "PYTHONPATH": path}}
+    names = ["a", "b", "c"]
+    jobs = [subprocess.Popen([sys.executable, "-c", BEGINS, tmp_path, name], **pipes) for name in names]  # type: ignore[call-overload]
+    for job in jobs:
+        job.stdout.readline()
+    for job in jobs:
+        job.stdin.close()
+    assert [job.wait() for job in jobs] == [0] * 3
+    table = Dataset(tmp_path).manifest.recordings
+    assert sorted(r.name for r in table) == names
+    assert sorted(r.seed for r in table) == [0, 1, 2]
+
+
+def reject(seed: int, stage: str, **values: object) -> Reject:
+    return Reject.model_validate({"task": "roll", "seed": seed, "stage": stage, "reason": f"because {seed}", **values})
+
+
+def test_what_was_rejected_can_be_listed_and_looked_at(tmp_path: Path) -> None:
+    poor = [with_quality(make_episode(k)) for k in (3, 1)]
+    begin(tmp_path, make_manifest({"roll": 4}))
+    rejects = (
+        reject(3, "quality", position=0, source="/rec/c"),
+        reject(2, "recording"),
+        reject(1, "quality", position=1),
+    )
+    receipt = make_receipt([make_episode(0)], unit="roll-000000-000003", seeds=(0, 3, 2, 1), rejects=rejects)
+    write_shard(tmp_path / receipt.shard, [make_episode(0)], "")
+    write_shard(tmp_path / receipt.rejects_shard, poor, "")
+    keep_receipt(tmp_path, receipt)
+    dataset = summarise(tmp_path)
+    found = [(x.task, x.seed, x.stage, x.reason, x.source, x.shard) for x in dataset.rejects]
+    kept = "rejects/roll-000000-000003.zarr"
+    assert found == [
+        ("roll", 1, "quality", "because 1", "", kept),
+        ("roll", 2, "recording", "because 2", "", None),
+        ("roll", 3, "quality", "because 3", "/rec/c", kept),
+    ]
+    assert_same(dataset.rejected(0), poor[1])
+    assert_same(dataset.rejected(2), poor[0])
+    with pytest.raises(DataError, match=r"roll seed 2 was rejected at recording \(because 2\), before there was"):
+        dataset.rejected(1)
+    with pytest.raises(DataError, match="no reject 3; there are 3, counted from 0"):
+        dataset.rejected(3)
+    assert [r.seed for r in dataset.refs] == [0], "a reject counts as an episode"
+    lines = [json.loads(line) for line in (tmp_path / "rejects.jsonl").read_text().splitlines()]
+    assert lines[0] == {
+        "task": "roll", "seed": 3, "stage": "quality", "reason": "because 3", "source": "/rec/c", "position": 0,
+    }  # fmt: skip
+    assert lines[1] == {"task": "roll", "seed": 2, "stage": "recording", "reason": "because 2"}

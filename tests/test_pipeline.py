@@ -1,19 +1,27 @@
 """A pipeline carries records from stage to stage, and says where and why one was kept out."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from synthetic import assert_same, make_episode
+from synthetic import CAMERA, assert_same, make_episode, make_manifest
 
-from flowlab.errors import UsageError
+from flowlab.errors import DataError, UsageError
+from flowlab.perception.observer import Box
+from flowlab.perception.queries import EdgeSettings
 from flowlab.pipeline.recipe import load_recipe
+from flowlab.pipeline.shared_stages import AcceptStage, ObserverStage, QueriesStage, WriteStage
 from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected, Stage, StageTally, Writer
-from flowlab.pipeline.stages import AcceptStage, ExpertStage, ObserverStage, QueriesStage, RigidFlowStage, WriteStage
-from flowlab.records import Demonstration, Episode, ObservedDemo, QueriedDemo
+from flowlab.pipeline.stages import ExpertStage, RigidFlowStage
+from flowlab.pipeline.units import WorkUnit
+from flowlab.pipeline.worker import run_unit
+from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo
+from flowlab.storage.dataset import Dataset, begin
 from flowlab.storage.shard import Shard
 
 
@@ -21,7 +29,7 @@ class Source(Stage):
     stage: str = "source"
 
     def process(self, record: EpisodeRequest) -> Episode:
-        return make_episode(record.seed, task=record.task, depth=True)
+        return make_episode(record.seed, task=record.task, depth=True, rgb=True)
 
 
 class OnlyEven(Stage):
@@ -30,6 +38,17 @@ class OnlyEven(Stage):
     def process(self, record: Episode) -> Episode:
         if record.seed % 2:
             raise Rejected(f"{record.seed} is odd")
+        return record
+
+
+class Kept(Stage):
+    """Rejects the odd ones, but keeps them."""
+
+    stage: str = "kept"
+
+    def process(self, record: Episode) -> Episode:
+        if record.seed % 2:
+            raise Rejected(f"{record.seed} is odd", episode=record)
         return record
 
 
@@ -89,12 +108,13 @@ def test_an_error_is_no_rejection() -> None:
     assert pipeline.tallies["write"].calls == 0
 
 
+@pytest.mark.parametrize("rgb", [False, True])
 @pytest.mark.parametrize("depth", [False, True])
-def test_write_stores_depth_only_if_asked(tmp_path: Path, depth: bool) -> None:
-    pipeline = Pipeline([Source(), WriteStage(depth=depth)])
+def test_write_stores_pictures_only_if_asked(tmp_path: Path, depth: bool, rgb: bool) -> None:
+    pipeline = Pipeline([Source(), WriteStage(depth=depth, rgb=rgb)])
     made = pipeline.run(EpisodeRequest(task="roll", seed=3))
-    source = make_episode(3, depth=True)
-    assert_same(made, source if depth else replace(source, depth=None))
+    source = make_episode(3, depth=True, rgb=True)
+    assert_same(made, replace(source, depth=source.depth if depth else None, rgb=source.rgb if rgb else None))
     pipeline.store(tmp_path / "unit.zarr", [made], "settings")
     assert_same(Shard(tmp_path / "unit.zarr").episode(0), made)
 
@@ -136,6 +156,97 @@ def test_stages_say_what_they_take_and_give() -> None:
     assert (ObserverStage.takes(), ObserverStage.gives()) == (Demonstration, ObservedDemo)
     assert (QueriesStage.takes(), QueriesStage.gives()) == (ObservedDemo, QueriedDemo)
     assert (Writer.takes(), Writer.gives()) == (Episode, Episode)
+
+
+STAGES_HERE = "name: here\nstages: [{stage: 'test_pipeline:Source'}, {stage: 'test_pipeline:%s'}, {stage: write}]"
+
+
+def test_what_was_rejected_with_its_episode_can_be_looked_at(tmp_path: Path) -> None:
+    (tmp_path / "receipts").mkdir()
+    unit = WorkUnit(task="roll", seeds=(0, 1, 2, 3), sources=("/a", "/b", "/c", "/d"))
+    begin(tmp_path, make_manifest({"roll": 4}))
+    receipt = run_unit(STAGES_HERE % "Kept", "digest", tmp_path, unit)
+    assert receipt.accepted == (0, 2)
+    assert [(x.seed, x.stage, x.reason, x.source, x.position) for x in receipt.rejects] == [
+        (1, "test_pipeline:Kept", "1 is odd", "/b", 0), (3, "test_pipeline:Kept", "3 is odd", "/d", 1),
+    ]  # fmt: skip
+    dataset = Dataset(tmp_path)
+    as_stored = replace(make_episode(3, rgb=True, depth=True), depth=None)
+    assert_same(dataset.rejected(1), as_stored)
+    assert [e.seed for e in dataset.episodes()] == [0, 2]
+
+
+def test_a_second_try_at_a_unit_leaves_nothing_of_the_first(tmp_path: Path) -> None:
+    """Its recording was mended, or its rules were changed: a shard that its receipt knows nothing of must not stay."""
+    (tmp_path / "receipts").mkdir()
+    unit = WorkUnit(task="roll", seeds=(1,))
+    run_unit(STAGES_HERE % "Kept", "digest", tmp_path, unit)
+    assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["rejects"]
+    run_unit(STAGES_HERE % "AsItIs", "digest", tmp_path, unit)
+    assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["shards"]
+    run_unit(STAGES_HERE % "OnlyEven", "digest", tmp_path, unit)
+    assert list(tmp_path.glob("*/*.zarr")) == []
+
+
+class AsItIs(Stage):
+    stage: str = "as-it-is"
+
+    def process(self, record: Episode) -> Episode:
+        return record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Still(Demonstration):
+    """Three times the same picture, one of which cannot be read."""
+
+    picture: Frame
+    bad: int = -1
+
+    def frame(self, t: int) -> Frame:
+        if t == self.bad:
+            raise DataError(f"depth/{t}.png is torn")
+        return self.picture
+
+
+def still(depth: np.ndarray, bad: int = -1) -> Still:
+    zeros = np.zeros((3, 1), np.float32)
+    return Still(
+        task="roll", seed=0, camera=CAMERA, time_s=np.arange(3.0), state=zeros, action=zeros, success=np.ones(3, bool),
+        picture=Frame(depth, CAMERA), bad=bad,
+    )  # fmt: skip
+
+
+ANYWHERE = ObserverStage(crop=Box(low=(-9, -9, -9), high=(9, 9, 9)))
+
+
+@pytest.mark.parametrize("bad", range(3))
+def test_a_frame_that_cannot_be_read_rejects_its_recording(bad: int) -> None:
+    """And does not end the run."""
+    with pytest.raises(Rejected, match=f"step {bad}: depth/{bad}.png is torn"):
+        ANYWHERE.process(still(np.ones((12, 16), np.float32), bad))
+
+
+def test_queries_keep_clear_of_edges_if_asked() -> None:
+    depth = np.full((12, 16), 1.0, np.float32)
+    depth[:, 8:] = 0.5
+    observed = ANYWHERE.process(still(depth))
+    columns = {}
+    for avoid in (None, EdgeSettings(margin_px=2)):
+        queries = QueriesStage(points=150, avoid_edges=avoid).process(observed).queries
+        columns[avoid is None] = set(np.rint(CAMERA.project(queries.xyz_world)[0][:, 0]).astype(int).tolist())
+    assert columns[True] == set(range(16))
+    assert columns[False] == set(range(16)) - set(range(5, 11))
+
+
+def test_simulation_needs_no_trackers_and_recordings_no_simulator() -> None:
+    for recipe, foreign in (
+        ("metaworld", ["cv2", "torch", "open3d", "flowlab.real"]),
+        ("real", ["mujoco", "torch", "open3d"]),
+    ):
+        code = "import sys; from flowlab.pipeline import worker, run; from flowlab.pipeline.recipe import load_recipe\n"
+        code += f"load_recipe({recipe!r}).pipeline(); print([m for m in {foreign!r} if m in sys.modules])"
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert result.stdout.strip() == "[]"
 
 
 def test_a_real_rejection_names_the_stage() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
-from flowlab.perception.queries import QuerySettings, sample_queries
+from flowlab.perception.queries import EdgeSettings, QuerySettings, away_from_edges, near_edges, sample_queries
 from flowlab.records import Cloud, Entity, Role
 
 PARTS = tuple(Entity(role.name.lower(), role.name.lower(), role) for role in Role)
@@ -114,3 +114,64 @@ def test_nothing_to_follow_is_an_error() -> None:
     empty = Cloud(np.empty((0, 3), np.float32), np.empty(0, np.int32))
     with pytest.raises(DataError, match="nothing for 'scene'"):
         query(empty)
+
+
+def step_edge(width: int = 24, height: int = 18) -> np.ndarray:
+    """A wall at 1 m, and before its right half something at 80 cm; a hole of one pixel in the wall."""
+    depth = np.full((height, width), 1.0, np.float32)
+    depth[:, width // 2 :] = 0.8
+    depth[4, 5] = 0
+    return depth
+
+
+@pytest.mark.parametrize("margin", [0, 1, 3])
+def test_near_edges_is_within_the_margin_of_a_step_or_a_hole(margin: int) -> None:
+    """Chebyshev distance to the pixels on either side of the step, and to the hole."""
+    depth = step_edge()
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    to_step = np.minimum(np.abs(u - 11), np.abs(u - 12))
+    to_hole = np.maximum(np.abs(v - 4), np.abs(u - 5))
+    found = near_edges(depth, EdgeSettings(jump=0.1, margin_px=margin))
+    np.testing.assert_array_equal(found, (to_step <= margin) | (to_hole <= margin))
+
+
+def test_what_counts_as_a_step_is_relative_to_the_nearer_reading() -> None:
+    for scale in (0.5, 1.0, 3.0):
+        depth = step_edge()[:, 8:] * np.float32(scale)
+        assert near_edges(depth, EdgeSettings(jump=0.24, margin_px=0)).any()
+        assert not near_edges(depth, EdgeSettings(jump=0.26, margin_px=0)).any()
+
+
+def test_a_slanted_surface_has_no_edges_and_a_flying_pixel_is_one() -> None:
+    slanted = np.tile(np.linspace(0.5, 1.0, 60, dtype=np.float32), (20, 1))
+    assert not near_edges(slanted, EdgeSettings()).any()
+    slanted[9, 30] += 0.1
+    assert near_edges(slanted, EdgeSettings())[7:12, 28:33].all()
+    assert near_edges(slanted, EdgeSettings(margin_px=0)).sum() == 5  # itself and its neighbours
+
+
+def seen(depth: np.ndarray) -> Cloud:
+    """Every pixel of a camera with one-pixel focal length, owned in turn by two things."""
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    pixel = np.flatnonzero(depth > 0).astype(np.int32)
+    xyz = np.stack([u * depth, v * depth, depth], -1).reshape(-1, 3)[pixel].astype(np.float32)
+    return Cloud(xyz, pixel, (pixel % 2).astype(np.int16), PARTS)
+
+
+def test_clouds_away_from_edges_are_the_rest_of_them_in_order() -> None:
+    depth = step_edge()
+    cloud = seen(depth)
+    clear = away_from_edges(cloud, depth, EdgeSettings(jump=0.1, margin_px=2))
+    mask = ~near_edges(depth, EdgeSettings(jump=0.1, margin_px=2)).reshape(-1)
+    np.testing.assert_array_equal(clear.pixel, np.flatnonzero(mask))
+    assert clear.owner is not None
+    np.testing.assert_array_equal(clear.owner, clear.pixel % 2)
+    kept = np.isin(cloud.pixel, clear.pixel)
+    np.testing.assert_array_equal(clear.xyz_world, cloud.xyz_world[kept])
+    assert clear.entities == PARTS
+
+
+def test_nothing_clear_of_edges_is_an_error_that_says_what_to_change() -> None:
+    depth = step_edge()
+    with pytest.raises(DataError, match=r"within 30 pixels of an edge .* lower queries\.avoid_edges\.margin_px"):
+        away_from_edges(seen(depth), depth, EdgeSettings(margin_px=30))

@@ -18,12 +18,13 @@ from flowlab.config import Settings
 from flowlab.errors import UsageError
 from flowlab.pipeline.recipe import Recipe, load_recipe, parse_recipe
 from flowlab.pipeline.stage import Stage
-from flowlab.pipeline.stages import STAGES
 from flowlab.storage.dataset import Dataset
 
 PIPELINES = Path(__file__).parent.parent / "pipelines"
 SHIPPED = sorted(PIPELINES.glob("*.yaml"))
 ALL = ["expert", "observer", "queries", "rigid-flow", "accept", "write"]
+REAL = ["recording", "observer", "queries", "track", "lift", "quality", "write"]
+STAGES_OF = {"metaworld": ALL, "metaworld-dp3": ALL, "real": REAL}
 
 
 def recipe_of(*stages: object, **more: object) -> str:
@@ -45,7 +46,7 @@ def test_shipped_recipes_load_by_name_and_by_file(path: Path) -> None:
     assert by_name == by_file
     assert by_name.name == path.stem
     assert by_name.description
-    assert [s.stage for s in by_name.stages] == ALL
+    assert [s.stage for s in by_name.stages] == STAGES_OF[path.stem]
     written = {
         s["stage"]: {k: v for k, v in s.items() if k != "stage"} for s in yaml.safe_load(path.read_text())["stages"]
     }
@@ -59,8 +60,8 @@ def contains(whole: Any, part: Any) -> bool:
     return whole == part
 
 
-def test_both_known_recipes_ship() -> None:
-    assert {p.stem for p in SHIPPED} == {"metaworld", "metaworld-dp3"}
+def test_all_known_recipes_ship() -> None:
+    assert {p.stem for p in SHIPPED} == STAGES_OF.keys()
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
@@ -70,13 +71,16 @@ def test_a_recipe_survives_its_json(path: Path) -> None:
     again = parse_recipe(recipe.model_dump_json(), "recipe")
     assert again == recipe
     assert again.settings() == recipe.settings() == json.loads(json.dumps(recipe.settings()))
-    assert list(again.settings()) == ALL
+    assert list(again.settings()) == STAGES_OF[path.stem]
 
 
 SENTENCES = {
     "unknown recipe key": (recipe_of(*ALL, episods=3), "no setting is called 'episods'; did you mean episodes"),
     "unknown stage": (recipe_of("expert", "obsever"), "no stage is called 'obsever'; did you mean observer?"),
-    "unlike any stage": (recipe_of("xyz"), "there are: accept, expert, observer, queries, rigid-flow, write"),
+    "unlike any stage": (
+        recipe_of("xyz"),
+        "there are: accept, expert, lift, observer, quality, queries, recording, rigid-flow, track, write",
+    ),
     "unknown setting": (
         recipe_of("expert", {"stage": "observer", "point": 5}),
         "stage 'observer': point: no setting is called 'point'; did you mean points",
@@ -119,6 +123,16 @@ SENTENCES = {
     "wrong start": (
         recipe_of("observer"),
         "stage 'observer' takes Demonstration, but the pipeline's start gives EpisodeRequest",
+    ),
+    "unknown tracker": (recipe_of({"stage": "track", "tracker": "bodie"}), "no tracker is called 'bodie'; did you"),
+    "unknown option of a tracker": (
+        recipe_of({"stage": "track", "tracker": "lucas-kanade", "options": {"windoww": 3}}),
+        "tracker 'lucas-kanade': no option is called 'windoww'",
+    ),
+    "wrong switch": (recipe_of("expert", {"stage": "observer", "remove_table": 5}), "stage 'observer': remove_table"),
+    "unknown setting of a switch": (
+        recipe_of("expert", {"stage": "queries", "avoid_edges": {"margin": 5}}),
+        "avoid_edges.margin: no setting is called 'margin'; did you mean margin_px",
     ),
     "the same stage twice": (recipe_of(*ALL[:-1], {"stage": "accept", "success_steps": 9}, "write"), "'accept'"),
 }  # fmt: skip
@@ -279,7 +293,8 @@ def test_settings_of_a_stage_in_a_package_can_be_changed(own_stages: str, tmp_pa
 def settings_models() -> list[type[Settings]]:
     """The shipped stages and every model their settings lead to."""
     found: list[type[Settings]] = []
-    todo: list[type[Settings]] = [Recipe, *STAGES]
+    shipped = [type(stage) for path in SHIPPED for stage in load_recipe(str(path)).stages]
+    todo: list[type[Settings]] = [Recipe, *shipped]
     while todo:
         model = todo.pop()
         if model in found or model is Stage:
@@ -317,5 +332,5 @@ def test_a_recipe_holds_what_its_stages_were_given() -> None:
     changed = recipe.model_copy(
         update={"stages": (*recipe.stages[:-1], recipe.stages[-1].model_copy(update={"depth": True}))}
     )
-    assert changed.settings()["write"] == {"depth": True}
-    assert recipe.settings()["write"] == {"depth": False}
+    assert changed.settings()["write"] == {"depth": True, "rgb": True}
+    assert recipe.settings()["write"] == {"depth": False, "rgb": True}

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,12 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import Zstd
-from synthetic import CAMERA, assert_same, make_episode
+from synthetic import CAMERA, assert_same, make_episode, with_quality
 
 from flowlab.errors import DataError
 from flowlab.records import Entity, Episode, Role
 from flowlab.storage.files import remove_leftovers
+from flowlab.storage.schema import QUALITY
 from flowlab.storage.shard import STEPS_PER_CHUNK, Shard, episode_digest, write_shard
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])}
@@ -39,6 +40,10 @@ def any_bits(rng: np.random.Generator, like: np.ndarray) -> np.ndarray:
 
 def scrambled(episode: Episode, seed: int) -> Episode:
     rng = np.random.default_rng(seed)
+    quality = episode.tracks.quality
+    if quality is not None:
+        measured = ("sigma", "source", "forward_backward", "disagreement", "residual")
+        quality = replace(quality, **{name: any_bits(rng, getattr(quality, name)) for name in measured})
     return replace(
         episode,
         **{
@@ -47,7 +52,7 @@ def scrambled(episode: Episode, seed: int) -> Episode:
             if (values := getattr(episode, name)) is not None
         },
         success=rng.random(len(episode)) < 0.5,
-        tracks=replace(episode.tracks, xyz_world=any_bits(rng, episode.tracks.xyz_world)),
+        tracks=replace(episode.tracks, xyz_world=any_bits(rng, episode.tracks.xyz_world), quality=quality),
     )
 
 
@@ -64,6 +69,7 @@ json_values = st.recursive(
     points=st.integers(1, 30),
     queries=st.integers(1, 9),
     options=st.fixed_dictionaries({name: st.booleans() for name in ("object_pose", "depth", "rgb")}),
+    estimated=st.booleans(),
     extras=st.dictionaries(st.text(), json_values, max_size=3),
     seed=st.integers(0, 2**31),
 )
@@ -73,12 +79,13 @@ def test_episodes_come_back_bit_for_bit(
     points: int,
     queries: int,
     options: dict[str, bool],
+    estimated: bool,
     extras: dict[str, Any],
     seed: int,
 ) -> None:
     path = tmp_path_factory.mktemp("shard") / "unit.zarr"
     made = [make_episode(seed + k, steps=n, points=points, queries=queries, **options) for k, n in enumerate(lengths)]
-    made = [replace(scrambled(e, e.seed), extras=extras) for e in made]
+    made = [replace(scrambled(with_quality(e, e.seed) if estimated else e, e.seed), extras=extras) for e in made]
     write_shard(path, made, "digest")
     shard = Shard(path)
     assert len(shard) == len(made)
@@ -180,6 +187,24 @@ def test_a_missing_array_is_an_error_that_names_it(path: Path, array: str) -> No
         list(Shard(path).episodes())
 
 
+def test_of_the_arrays_of_quality_none_may_be_missing(tmp_path: Path) -> None:
+    write_shard(tmp_path / "unit.zarr", [with_quality(make_episode())], "")
+    shutil.rmtree(tmp_path / "unit.zarr/data/source")
+    with pytest.raises(DataError, match="data/source: the array is missing"):
+        Shard(tmp_path / "unit.zarr").episode(0)
+    for name in QUALITY:
+        shutil.rmtree(tmp_path / "unit.zarr" / name, ignore_errors=True)
+    assert Shard(tmp_path / "unit.zarr").episode(0).tracks.quality is None
+
+
+def test_a_recording_without_a_robot_is_stored_too(tmp_path: Path) -> None:
+    """Neither state nor action: arrays with rows, and nothing in them."""
+    nothing = np.zeros((12, 0), np.float32)
+    watched = replace(make_episode(), state=nothing, action=nothing)
+    write_shard(tmp_path / "unit.zarr", [watched], "")
+    assert_same(watched, Shard(tmp_path / "unit.zarr").episode(0))
+
+
 def test_describing_a_shard_that_lacks_an_array_says_so(path: Path) -> None:
     shutil.rmtree(path / "meta/episode_ends")
     with pytest.raises(DataError, match="meta/episode_ends"):
@@ -219,6 +244,7 @@ MIXED = {
     "cameras": lambda e: replace(e, camera=replace(e.camera, K=2 * e.camera.K)),
     "things": lambda e: replace(e, queries=replace(e.queries, entities=(Entity("x", "x", Role.ROBOT),) * 2)),
     "arrays": lambda e: replace(e, object_pose=None),
+    "kinds of tracks": with_quality,
 }
 """Episodes that one shard cannot tell apart: it has one camera, one list of things, one set of arrays."""
 
@@ -240,7 +266,7 @@ def test_the_digest_of_an_episode_does_not_depend_on_its_shard(tmp_path: Path, e
 
 
 def test_the_digest_changes_with_everything_that_is_stored() -> None:
-    plain = make_episode(0, depth=True, rgb=True)
+    plain = with_quality(make_episode(0, depth=True, rgb=True))
     q, tr = plain.queries, plain.tracks
 
     def nudged(a: np.ndarray | None) -> np.ndarray:
@@ -255,6 +281,12 @@ def test_the_digest_changes_with_everything_that_is_stored() -> None:
     changed += [replace(plain, **{name: None}) for name in ("object_pose", "depth", "rgb")]
     changed += [replace(plain, tracks=replace(tr, **{n: nudged(getattr(tr, n))})) for n in
                 ("xyz_world", "visible", "association_distance")]  # fmt: skip
+    assert tr.quality is not None
+    changed += [
+        replace(plain, tracks=replace(tr, quality=replace(tr.quality, **{f.name: nudged(getattr(tr.quality, f.name))})))
+        for f in fields(tr.quality)
+    ]
+    changed += [replace(plain, tracks=replace(tr, quality=None))]
     changed += [replace(plain, queries=replace(q, **{n: nudged(getattr(q, n))})) for n in ("xyz_world", "owner")]
     changed += [
         replace(plain, queries=replace(q, count=q.count - 1)),

@@ -11,9 +11,9 @@ import pytest
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic import make_dataset, make_episode, make_manifest, with_tracks
+from synthetic import make_dataset, make_episode, make_manifest, with_quality, with_tracks
 
-from flowlab.records import Episode
+from flowlab.records import Episode, Source
 from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset, begin, summarise
 
@@ -146,3 +146,26 @@ def test_statistics_of_a_real_dataset_follow_from_its_arrays(small_dataset: Path
         truth = np.quantile(step, int(q[1:]) / 100)
         assert truth == pytest.approx(value, rel=0.06, abs=1e-6)
     assert Dataset(small_dataset).stats == found
+
+
+def test_quality_is_that_of_all_positions_together(tmp_path: Path) -> None:
+    made = [with_quality(make_episode(k, steps=5 + 7 * k), k) for k in range(4)]
+    found = make_dataset(tmp_path, [made[:1], made[1:3], made[3:]], settings={"track": {"tracker": "by-hand"}}).stats
+    quality = [e.tracks.quality for e in made]
+    sigma = np.concatenate([q.sigma.ravel() for q in quality if q])
+    source = np.concatenate([q.source.ravel() for q in quality if q])
+    visible = np.concatenate([e.tracks.visible.ravel() for e in made])
+    for name, values in {"sigma_m": sigma, "visible_sigma_m": sigma[visible]}.items():
+        for q in (50, 90, 95):
+            assert np.quantile(values, q / 100) == pytest.approx(found["quality"][name][f"p{q}"], rel=0.06)
+    assert found["quality"]["visible_share"] == pytest.approx(visible.mean())
+    shares = {s.name.lower(): np.mean(source == s) for s in (Source.MEASURED, Source.MODEL, Source.FILLED)}
+    assert found["quality"]["source_share"] == pytest.approx(shares)
+    card = (tmp_path / "README.md").read_text()
+    assert "estimated from pictures, by the tracker `by-hand`" in card
+    assert f"{shares['measured']:.0%} are measured, {shares['model']:.0%} are model" in card
+
+
+def test_exact_tracks_have_no_quality_to_tell_of(small_dataset: Path) -> None:
+    assert "quality" not in Dataset(small_dataset).stats
+    assert "estimated" not in (small_dataset / "README.md").read_text()

@@ -4,6 +4,7 @@ import random
 import threading
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,10 +14,12 @@ from hypothesis import strategies as st
 
 from flowlab.errors import UsageError
 from flowlab.pipeline.engine import Outcome
-from flowlab.pipeline.run import _run_all
-from flowlab.pipeline.units import Share, WorkUnit, next_units, unit_size
+from flowlab.pipeline.plans import Progress, RecordingPlan, SeedPlan, next_units, unit_size
+from flowlab.pipeline.run import run_all
+from flowlab.pipeline.units import Share, WorkUnit
 from flowlab.storage.dataset import keep_receipt
-from flowlab.storage.manifest import Receipt, read_receipts
+from flowlab.storage.manifest import Receipt, Reject, read_receipts
+from flowlab.storage.recorded import Recorded
 
 TASKS = ("push", "roll")
 
@@ -86,7 +89,7 @@ def run_shares(world: World, wanted: dict[str, int], first_seed: int, shares: in
         turn[k].acquire()
         engine = RandomEngine(world, k, pause(k), cut_off.get(k))
         try:
-            assert _run_all(engine, wanted, first_seed, world.folder, Share(k, shares), lambda _: None) == []
+            assert run_all(engine, SeedPlan(wanted, first_seed), world.folder, Share(k, shares), lambda _: None) == []
         except CutOff:
             pass
         except BaseException as error:
@@ -160,7 +163,7 @@ def test_any_way_to_run_gives_the_first_successes_in_seed_order(
         for k in range(shares):
             engine = RandomEngine(world, k, lambda: None, cut_off.get(k))
             try:
-                _run_all(engine, wanted, first_seed, folder, Share(k, shares), lambda _: None)
+                run_all(engine, SeedPlan(wanted, first_seed), folder, Share(k, shares), lambda _: None)
             except CutOff:
                 return
 
@@ -189,7 +192,7 @@ def test_extending_a_dataset_step_by_step_gives_the_same_seeds(
     world = World(folder, lambda _, s: random.Random(f"{s} {seed}").random() < 0.6, random.Random(seed))
     for n in sorted(requests):
         before = read_receipts(folder)
-        _run_all(RandomEngine(world, 0, lambda: None, None), {"push": n}, 0, folder, Share(), lambda _: None)
+        run_all(RandomEngine(world, 0, lambda: None, None), SeedPlan({"push": n}, 0), folder, Share(), lambda _: None)
         check_seeds(world, {"push": n}, 0)
         assert all(r in read_receipts(folder) for r in before)
     assert max(Counter(world.tried).values()) == 1
@@ -206,10 +209,11 @@ def test_units_given_up_are_not_tried_again_in_the_same_run(tmp_path: Path) -> N
             return Outcome(unit, None, "died") if 2 in unit.seeds else Outcome(unit, self.world.do(0, unit))
 
     engine = Failing(world, 0, lambda: None, None)
-    failures = _run_all(engine, {"push": 5}, 0, tmp_path, Share(), lambda _: None)
+    failures = run_all(engine, SeedPlan({"push": 5}, 0), tmp_path, Share(), lambda _: None)
     assert [f.unit.seeds for f in failures] == [(2, 3)]
     assert sorted(s for _, _, s in world.tried) == [0, 1, 4, 5]
-    assert _run_all(RandomEngine(world, 0, lambda: None, None), {"push": 5}, 0, tmp_path, Share(), lambda _: None) == []
+    engine = RandomEngine(world, 0, lambda: None, None)
+    assert run_all(engine, SeedPlan({"push": 5}, 0), tmp_path, Share(), lambda _: None) == []
     check_seeds(world, {"push": 5}, 0)
 
 
@@ -222,6 +226,64 @@ def test_the_first_round_is_cut_the_same_for_every_share() -> None:
     ]
     assert shares[0][0].name == "push-000003-000004"
     assert shares[2][1].name == "push-000013"
+
+
+def recordings(n: int) -> list[Recorded]:
+    """Numbered through, in two tasks."""
+    return [Recorded(task=TASKS[k % 2], name=f"take {k}", seed=k, source=f"/rec/{k}") for k in range(n)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    counts=st.lists(st.integers(0, 12), min_size=1, max_size=3),
+    shares=st.integers(1, 4),
+    cut_offs=st.lists(st.dictionaries(st.integers(0, 3), st.integers(0, 6), max_size=4), max_size=3),
+    seed=st.integers(0, 2**31),
+)
+def test_any_way_to_run_does_every_recording_once(
+    tmp_path_factory: pytest.TempPathFactory,
+    counts: list[int],
+    shares: int,
+    cut_offs: list[dict[int, int]],
+    seed: int,
+) -> None:
+    """Rejected ones too, and whatever was added later."""
+    folder = tmp_path_factory.mktemp("units")
+    (folder / "receipts").mkdir()
+    world = World(folder, lambda t, s: random.Random(f"{t} {s} {seed}").random() < 0.5, random.Random(seed))
+    for count in sorted(counts):
+        plan = RecordingPlan(recordings(count))
+        for cut_off in [*cut_offs, {}]:
+            for k in range(shares):
+                engine = RandomEngine(world, k, lambda: None, cut_off.get(k))
+                with suppress(CutOff):
+                    run_all(engine, plan, folder, Share(k, shares), lambda _: None)
+    asked = [(r.task, r.seed) for r in recordings(max(counts))]
+    assert sorted((t, s) for _, t, s in world.tried) == sorted(asked), "left out, or tried again"
+    assert all(share == s % shares for share, _, s in world.tried)
+
+
+def test_a_recording_is_a_unit_that_says_where_it_lies() -> None:
+    done = Receipt(unit="push-000000", task="push", seeds=(0,), accepted=(), frames=(), digests=())
+    under_way = WorkUnit(task="roll", seeds=(1,), sources=("/rec/1",))
+    units = list(RecordingPlan(recordings(5)).next_units([done], [under_way], Share(0, 2)))
+    assert units == [
+        WorkUnit(task="push", seeds=(2,), sources=("/rec/2",)),
+        WorkUnit(task="push", seeds=(4,), sources=("/rec/4",)),
+    ]
+    (request,) = units[0].requests
+    assert (request.task, request.seed, request.source) == ("push", 2, "/rec/2")
+    assert [r.source for r in WorkUnit(task="push", seeds=(2, 3)).requests] == ["", ""]
+
+
+def test_progress_is_that_of_the_recordings_of_this_run() -> None:
+    poor = Reject(task="roll", seed=1, stage="quality", reason="poor")
+    receipts = [
+        Receipt(unit="push-000000", task="push", seeds=(0,), accepted=(0,), frames=(1,), digests=("",)),
+        Receipt(unit="roll-000001", task="roll", seeds=(1,), accepted=(), frames=(), digests=(), rejects=(poor,)),
+        Receipt(unit="roll-000003", task="roll", seeds=(3,), accepted=(3,), frames=(1,), digests=("",)),
+    ]
+    assert RecordingPlan(recordings(3)).progress(receipts) == Progress(1, 3, 1)
 
 
 @pytest.mark.parametrize(("episodes", "size"), [(1, 2), (10, 2), (47, 2), (48, 3), (160, 10), (256, 16), (10_000, 16)])

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import zarr
 from conftest import Cli
-from synthetic import call_cli, make_dataset, make_episode, with_tracks
+from synthetic import call_cli, make_dataset, make_episode, make_receipt, with_quality, with_tracks
 
-from flowlab.records import Episode
-from flowlab.storage.dataset import Dataset
+from flowlab.records import Episode, Source
+from flowlab.storage.dataset import Dataset, keep_receipt
+from flowlab.storage.manifest import Reject
 from flowlab.storage.shard import Shard, episode_digest, write_shard
 from flowlab.storage.validate import validate
 
@@ -265,3 +266,116 @@ def test_what_it_says_to_do_mends_the_dataset(small_dataset: Path, tmp_path: Pat
     assert result.returncode == 0, result.stderr
     assert list(validate(data)) == []
     assert Dataset(data).fingerprint == Dataset(small_dataset).fingerprint
+
+
+def estimated(seed: int = 0) -> Episode:
+    """Every point is seen all the time, and known to 5 mm."""
+    episode = make_episode(seed, steps=40, points=256, queries=100)
+    seen = replace(episode, tracks=replace(episode.tracks, visible=np.ones_like(episode.tracks.visible)))
+    return changed_quality(with_quality(seen), sigma=np.float32(0.005))
+
+
+def changed_quality(e: Episode, **values: Any) -> Episode:
+    """The episode with parts of its quality replaced; numbers stand for whole arrays."""
+    quality = e.tracks.quality
+    assert quality is not None
+    full = {
+        name: np.broadcast_to(v, e.tracks.visible.shape).astype(getattr(quality, name).dtype)
+        for name, v in values.items()
+    }
+    return replace(e, tracks=replace(e.tracks, quality=replace(quality, **full)))
+
+
+def jumping(e: Episode, points: int, metres: float = 0.5) -> Episode:
+    """Some points are suddenly elsewhere, for good."""
+    xyz = e.tracks.xyz_world.copy()
+    xyz[20:, :points, 2] += metres
+    return with_tracks(e, xyz)
+
+
+def hidden(e: Episode, points: int, source: Source) -> Episode:
+    visible = e.tracks.visible.copy()
+    visible[20:, :points] = False
+    return changed_quality(replace(e, tracks=replace(e.tracks, visible=visible)), source=np.where(visible, 1, source))
+
+
+def at(t: int, m: int, value: object, elsewhere: object) -> np.ndarray:
+    values = np.full((40, 100), elsewhere)
+    values[t, m] = value
+    return values
+
+
+ESTIMATED_HARMS: dict[str, tuple[Callable[[Episode], Episode], str]] = {
+    "no error stated": (
+        lambda e: changed_quality(e, sigma=at(3, 7, 0.0, 0.005)),
+        "sigma: point 7 at step 3 states an error",
+    ),
+    "error without end": (lambda e: changed_quality(e, sigma=at(3, 7, np.inf, 1.0)), "sigma: not finite at step 3"),
+    "source of simulation": (lambda e: changed_quality(e, source=0), "source: point 0 at step 0 has a source"),
+    "source of nothing": (lambda e: changed_quality(e, source=at(9, 2, 4, 1)), "source: point 2 at step 9 has a"),
+    "hidden, yet measured": (
+        lambda e: hidden(e, 5, Source.MEASURED),
+        "visible: point 0 at step 20 is measured, yet not visible, and so are 99",
+    ),
+    "measured without depth": (
+        lambda e: changed_quality(e, depth_valid=at(1, 1, False, True)),
+        "depth_valid: point 1 at step 1 is measured",
+    ),
+    "negative distance": (
+        lambda e: changed_quality(e, disagreement=at(2, 2, -0.5, 0.1)),
+        "disagreement: point 2 at step 2 is below 0",
+    ),
+    "jumps": (lambda e: jumping(e, 60), "tracks: 60 of 3900 steps of visible points are jumps"),
+    "off the surface": (lambda e: with_tracks(e, e.tracks.xyz_world + np.float32(0.06)), OFF_SURFACE),
+    "no quality at all": (
+        lambda e: replace(e, tracks=replace(e.tracks, quality=None)),
+        "sigma: missing; estimated tracks must state",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ESTIMATED_HARMS)
+def test_harm_to_estimated_tracks_is_found(name: str, tmp_path: Path) -> None:
+    harm, says = ESTIMATED_HARMS[name]
+    points = {"observer": {"points": 256}, "queries": {"points": 100}, "track": {}}
+    make_dataset(tmp_path, [[harm(estimated())]], settings=points)
+    findings = [str(f) for f in validate(tmp_path)]
+    assert any(says in f.replace("seed 0: ", "") for f in findings), findings
+    assert len(findings) == 1 or name == "jumps", findings
+
+
+ESTIMATED_SOUND: dict[str, Callable[[Episode], Episode]] = {
+    "as it is": lambda e: e,
+    "few jumps": lambda e: jumping(e, 3),
+    "jumps as far as their stated errors": lambda e: changed_quality(jumping(e, 60), sigma=0.4),
+    "jumps in hiding": lambda e: hidden(jumping(e, 60), 60, Source.MODEL),
+    "jumps that are filled in": lambda e: changed_quality(
+        jumping(e, 60), source=np.where(np.arange(100) < 60, Source.FILLED, Source.MEASURED)
+    ),
+    "a hand, filmed slowly": lambda e: changed_quality(
+        replace(jumping(e, 60, 0.5), time_s=np.arange(40) * 0.2), source=Source.MODEL
+    ),
+    "unknown to the tracker": lambda e: changed_quality(e, forward_backward=-1, disagreement=-1, residual=-1),
+}
+
+
+@pytest.mark.parametrize("name", ESTIMATED_SOUND)
+def test_estimated_tracks_may_be_wrong_if_they_say_so(name: str, tmp_path: Path) -> None:
+    points = {"observer": {"points": 256}, "queries": {"points": 100}, "track": {}}
+    make_dataset(tmp_path, [[ESTIMATED_SOUND[name](estimated())]], settings=points)
+    assert [str(f) for f in validate(tmp_path)] == []
+
+
+def test_a_kept_reject_must_be_there_and_no_other(tmp_path: Path) -> None:
+    data = make_dataset(tmp_path, [[make_episode(0)]])
+    reject = Reject(task="roll", seed=1, stage="quality", reason="poor", position=0)
+    nothing = {"accepted": (), "frames": (), "digests": (), "stats": {}}
+    keep_receipt(tmp_path, make_receipt([make_episode(1)], unit="roll-000001", rejects=(reject,), **nothing))
+    (finding,) = validate(tmp_path)
+    assert finding.place == f"{tmp_path}/rejects/roll-000001.zarr"
+    assert "receipts/roll-000001.json keeps a rejected episode there" in finding.problem
+    write_shard(tmp_path / "rejects/roll-000001.zarr", [make_episode(1)], data.manifest.settings_digest)
+    assert list(validate(tmp_path)) == []
+    write_shard(tmp_path / "rejects/roll-000002.zarr", [make_episode(2)], data.manifest.settings_digest)
+    (finding,) = validate(tmp_path)
+    assert finding.place == f"{tmp_path}/rejects/roll-000002.zarr"

@@ -12,6 +12,8 @@ from flowlab.errors import FlowlabError
 _COMMANDS = {
     "tasks": ("flowlab.cli.tasks:tasks", "List MetaWorld's 50 tasks."),
     "extract-sim": ("flowlab.cli.extract_sim:extract_sim", "Make a 3D-flow dataset of simulated demonstrations."),
+    "track-real": ("flowlab.cli.track_real:track_real", "Make a 3D-flow dataset of RGB-D recordings of a robot."),
+    "grade": ("flowlab.cli.grade:grade", "Measure the error of estimated tracks against known ones."),
     "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
     "validate": ("flowlab.cli.datasets:validate", "Check a dataset for everything that would spoil training."),
     "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording or a PNG."),

@@ -14,7 +14,7 @@ from flowlab.errors import DataError
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def info(dataset: Path, as_json: bool) -> None:
     """Say what a dataset holds and how it was made."""
-    from flowlab.cli.reports import folder_size, stage_rows, task_rows
+    from flowlab.cli.reports import folder_size, print_quality, stage_rows, task_rows
     from flowlab.storage.dataset import Dataset
     from flowlab.storage.shard import Shard
 
@@ -32,10 +32,11 @@ def info(dataset: Path, as_json: bool) -> None:
         "missing": data.missing,
         "world_frame": data.manifest.world_frame,
     }
+    manifest = json.loads(data.manifest.model_dump_json())
     if as_json:
-        settings = json.loads(data.manifest.model_dump_json())["settings"]
-        more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats, "settings": settings}
-        print_json({**about, **more})
+        recordings = {"recordings": manifest["recordings"]} if manifest["recordings"] else {}
+        more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats}
+        print_json({**about, **more, "settings": manifest["settings"], **recordings})
         return
     for name, value in about.items():
         click.echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
@@ -46,6 +47,7 @@ def info(dataset: Path, as_json: bool) -> None:
         for name, a in data.stats["arrays"].items()
     ]
     print_table(["array", "min", "max", "mean", "std"], limits)
+    print_quality(data.stats)
 
 
 def _numbers(values: list[float]) -> str:

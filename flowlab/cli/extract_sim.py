@@ -53,6 +53,7 @@ def extract_sim(
     """
     sys.path.insert(0, os.getcwd())  # a recipe's own stages may lie beside it
     try:
+        import flowlab.pipeline.stages  # noqa: F401 - MuJoCo comes with it
         from flowlab.pipeline.engine import LocalEngine
         from flowlab.pipeline.recipe import load_recipe
         from flowlab.pipeline.run import Progress, extract

@@ -1,7 +1,7 @@
 """The Observer: unproject, crop, sample. There is one, for labelling, training data and evaluation."""
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
 import numba
 import numpy as np
@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
+from flowlab.perception.tidy import SWITCH, OutlierSettings, TableSettings, above_table, not_stray
 from flowlab.records import Cloud, Entity, Frame, Observation, Role
 
 Vector3 = tuple[float, float, float]
@@ -43,6 +44,10 @@ class ObserverSettings(Settings):
     """Remove floor, walls and table by what owns the pixel; where owners are unknown the box must do."""
     padding: Literal["repeat", "zeros"] = "repeat"
     """What fills the sample when fewer points remain: its own points again, or zeros as DP3 does."""
+    remove_table: Annotated[TableSettings | None, SWITCH] = None
+    """Remove the largest plane in the crop and what lies below it; null keeps it."""
+    remove_outliers: Annotated[OutlierSettings | None, SWITCH] = None
+    """Then remove stray points; null keeps them."""
 
     def crop_for(self, task: str) -> Box:
         """The workspace of a task."""
@@ -64,12 +69,18 @@ class Observer:
         self._kept: tuple[tuple[Entity, ...] | None, np.ndarray] = (None, np.ones(1, bool))
 
     def cloud(self, frame: Frame) -> Cloud:
-        """Every point of the frame inside the crop, in pixel order."""
+        """Every point of the frame inside the crop that is not cleared away, in pixel order."""
         owner = np.full((1, 1), -1, np.int16) if frame.owner is None else frame.owner
         cam = frame.camera
         xyz, pixel = _unproject_and_crop(
             frame.depth, owner, self._kept_owners(frame.entities), cam.K, cam.T_world_cam, self._low, self._high
         )
+        if self.settings.remove_table is not None:
+            kept = above_table(xyz, cam.T_world_cam[:3, 3], self.settings.remove_table)
+            xyz, pixel = xyz[kept], pixel[kept]
+        if self.settings.remove_outliers is not None:
+            kept = not_stray(xyz, self.settings.remove_outliers)
+            xyz, pixel = xyz[kept], pixel[kept]
         return Cloud(xyz, pixel, None if frame.owner is None else owner.reshape(-1)[pixel], frame.entities)
 
     def sample(self, cloud: Cloud) -> Observation:

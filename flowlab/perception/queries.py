@@ -1,16 +1,32 @@
 """Which points to follow."""
 
 import math
-from typing import Literal
+from dataclasses import replace
+from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float32
 from pydantic import Field
+from scipy.ndimage import binary_dilation
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
 from flowlab.perception.observer import pad
+from flowlab.perception.tidy import SWITCH
 from flowlab.records import Cloud, Queries, Role
+
+
+class EdgeSettings(Settings):
+    """Where a real camera's depth cannot be trusted: beside edges and holes of the depth picture.
+
+    A pixel that sees two surfaces is read somewhere between them; farthest-point sampling prefers such points.
+    """
+
+    jump: float = Field(default=0.02, gt=0)
+    """Neighbouring readings that differ by more than this share of the nearer one have an edge between them."""
+    margin_px: int = Field(default=2, ge=0)
+    """Points up to this many rows and columns from an edge or a hole are not chosen."""
 
 
 class QuerySettings(Settings):
@@ -24,6 +40,8 @@ class QuerySettings(Settings):
     scene around them."""
     object_share: float = Field(default=1 / 3, gt=0, lt=1)
     """The share ``stratified`` guarantees, as far as that many object points are in view."""
+    avoid_edges: Annotated[EdgeSettings | None, SWITCH] = None
+    """Choose no points near edges and holes of the depth picture; null does, which is right where depth is exact."""
 
 
 def sample_queries(cloud: Cloud, settings: QuerySettings) -> Queries:
@@ -37,6 +55,33 @@ def sample_queries(cloud: Cloud, settings: QuerySettings) -> Queries:
     owner = np.full(len(cloud.xyz_world), -1, np.int16) if cloud.owner is None else cloud.owner
     filled = pad(index, settings.points)
     return Queries(cloud.xyz_world[filled], owner[filled], len(index), cloud.entities)
+
+
+def away_from_edges(cloud: Cloud, depth: Float32[np.ndarray, "H W"], settings: EdgeSettings) -> Cloud:
+    """The part of a frame's cloud that lies clear of the edges and holes of its depth picture.
+
+    Raises :class:`DataError` where that is nothing.
+    """
+    kept = ~near_edges(depth, settings).reshape(-1)[cloud.pixel]
+    if not kept.any():
+        raise DataError(
+            f"no point to follow: every point of the first frame lies within {settings.margin_px} pixels of an edge or "
+            "a hole of the depth picture; lower queries.avoid_edges.margin_px or raise queries.avoid_edges.jump"
+        )
+    owner = None if cloud.owner is None else cloud.owner[kept]
+    return replace(cloud, xyz_world=cloud.xyz_world[kept], pixel=cloud.pixel[kept], owner=owner)
+
+
+def near_edges(depth: Float32[np.ndarray, "H W"], settings: EdgeSettings) -> Bool[np.ndarray, "H W"]:
+    """Which pixels lie within the margin of an edge or a hole of a depth picture [m], 0 where there is no reading."""
+    edge = ~(depth > 0)
+    for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        nearer = np.minimum(depth[a], depth[b])
+        apart = (nearer > 0) & (np.abs(depth[a] - depth[b]) > settings.jump * nearer)
+        edge[a] |= apart
+        edge[b] |= apart
+    size = 2 * settings.margin_px + 1
+    return binary_dilation(edge, np.ones((size, size), bool))
 
 
 def _choose(cloud: Cloud, settings: QuerySettings) -> np.ndarray:

@@ -24,6 +24,7 @@ _WORKER_ENVIRONMENT = (
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
     "LP_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
     "MALLOC_ARENA_MAX",
 )
 """All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
@@ -58,11 +59,14 @@ StartEngine = Callable[[Callable[[WorkUnit], Receipt]], AbstractContextManager[E
 class LocalEngine:
     """A pool of processes on this machine.
 
-    A worker that dies loses its own unit only, which is tried once more in a fresh worker.
+    A worker that dies loses its own unit only, which is tried once more in a fresh worker. ``stages`` is the module
+    of the stages they will need.
     """
 
-    def __init__(self, work: Callable[[WorkUnit], Receipt], workers: int) -> None:
-        self._work, self._workers = work, workers
+    def __init__(
+        self, work: Callable[[WorkUnit], Receipt], workers: int, stages: str = "flowlab.pipeline.stages"
+    ) -> None:
+        self._work, self._workers, self._stages = work, workers, stages
         self._tries: dict[Future[Receipt], tuple[WorkUnit, int]] = {}
 
     def __enter__(self) -> Self:
@@ -70,7 +74,7 @@ class LocalEngine:
             os.environ.setdefault(name, "1")
         # Workers are forked from a clean process that has imported everything once, and share its memory.
         context = get_context("forkserver")
-        context.set_forkserver_preload(["flowlab.pipeline.worker"])
+        context.set_forkserver_preload(["flowlab.pipeline.worker", self._stages])
         self._pool = ProcessPool(
             max_workers=self._workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )

@@ -14,9 +14,20 @@ from pydantic import Field, SerializeAsAny, ValidationError, field_validator
 from flowlab.config import Settings
 from flowlab.errors import UsageError, unknown
 from flowlab.pipeline.stage import Pipeline, Stage
-from flowlab.pipeline.stages import STAGES
 
-_BY_NAME = {cls.model_fields["stage"].default: cls for cls in STAGES}
+_STAGES = {
+    "expert": "flowlab.pipeline.stages:ExpertStage",
+    "recording": "flowlab.pipeline.real_stages:RecordingStage",
+    "observer": "flowlab.pipeline.shared_stages:ObserverStage",
+    "queries": "flowlab.pipeline.shared_stages:QueriesStage",
+    "rigid-flow": "flowlab.pipeline.stages:RigidFlowStage",
+    "track": "flowlab.pipeline.real_stages:TrackStage",
+    "lift": "flowlab.pipeline.real_stages:LiftStage",
+    "quality": "flowlab.pipeline.real_stages:QualityStage",
+    "accept": "flowlab.pipeline.shared_stages:AcceptStage",
+    "write": "flowlab.pipeline.shared_stages:WriteStage",
+}
+"""Imported only when a recipe names them: simulation needs no trackers, and recordings no simulator."""
 
 
 class Recipe(Settings):
@@ -101,23 +112,28 @@ def _make_stage(values: Any) -> Stage:
     if not isinstance(values, Mapping) or not isinstance(values.get("stage"), str):
         raise UsageError(f"every stage needs a name, as in 'stage: observer'; found {values!r}")
     name = values["stage"]
-    cls = _import_stage(name) if ":" in name else _BY_NAME.get(name)
-    if cls is None:
-        raise unknown("stage", name, _BY_NAME)
+    if ":" not in name and name not in _STAGES:
+        raise unknown("stage", name, _STAGES)
+    cls = _own_stage(name) if ":" in name else _load(_STAGES[name])
     try:
         return cls.model_validate(dict(values))
     except ValidationError as error:
         raise UsageError(f"stage '{name}': {_explain(error, cls)}") from error
 
 
-def _import_stage(name: str) -> type[Stage]:
-    module, _, attribute = name.partition(":")
+def _own_stage(name: str) -> type[Stage]:
     try:
-        cls = getattr(importlib.import_module(module), attribute)
+        cls = _load(name)
     except Exception as error:  # whatever somebody's module does
         raise UsageError(f"stage '{name}': cannot be imported ({error})") from error
     if not (isinstance(cls, type) and issubclass(cls, Stage)):
         raise UsageError(f"stage '{name}': is not a subclass of flowlab.pipeline.stage.Stage")
+    return cls
+
+
+def _load(place: str) -> type[Stage]:
+    module, _, attribute = place.partition(":")
+    cls: type[Stage] = getattr(importlib.import_module(module), attribute)
     return cls
 
 

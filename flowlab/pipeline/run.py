@@ -3,24 +3,24 @@
 import errno
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from flowlab.errors import FlowlabError, UnfinishedError
 from flowlab.pipeline.engine import Engine, Outcome, StartEngine
+from flowlab.pipeline.plans import Plan, Progress, SeedPlan
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
-from flowlab.pipeline.stages import ExpertStage
-from flowlab.pipeline.units import Share, WorkUnit, next_units
+from flowlab.pipeline.units import Share, WorkUnit
 from flowlab.pipeline.worker import run_unit
-from flowlab.sim.rollout import Studio
 from flowlab.storage.dataset import Dataset, begin, summarise
 from flowlab.storage.manifest import Manifest, Receipt, read_receipts
 from flowlab.storage.schema import SCHEMA
+
+__all__ = ["Progress", "estimate", "extract", "fill", "manifest_for", "run_all"]
 
 _WORLD_FRAMES = {
     "flowlab": "MetaWorld's own: z up, table top at z = 0 in most tasks, the robot's base at the origin facing +y",
@@ -29,17 +29,11 @@ _WORLD_FRAMES = {
 _SECONDS_BETWEEN_SUMMARIES = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a run is: episodes accepted of those wanted, and seeds rejected on the way."""
-
-    accepted: int
-    wanted: int
-    rejected: int
-
-
 def manifest_for(recipe: Recipe, tasks: tuple[str, ...]) -> Manifest:
     """The manifest of the dataset a recipe makes."""
+    from flowlab.pipeline.stages import ExpertStage  # recordings need no simulator
+    from flowlab.sim.rollout import Studio
+
     expert = next((s for s in recipe.stages if isinstance(s, ExpertStage)), None)
     if expert is None:
         raise FlowlabError(f"recipe {recipe.name}: extract-sim needs an 'expert' stage at the start")
@@ -70,19 +64,38 @@ def extract(
     ``start_engine`` makes an engine for the function that does a unit, as
     ``partial(LocalEngine, workers=4)`` does.
 
+    See :func:`fill` for what is raised.
+    """
+    plan = SeedPlan(dict.fromkeys(tasks, recipe.episodes), recipe.first_seed)
+    manifest = manifest_for(recipe, tasks)
+    return fill(recipe, manifest, lambda _: plan, folder, start_engine=start_engine, share=share, report=report)
+
+
+def fill(
+    recipe: Recipe,
+    manifest: Manifest,
+    plan_for: Callable[[Manifest], Plan],
+    folder: Path,
+    *,
+    start_engine: StartEngine,
+    share: Share,
+    report: Callable[[Progress], None],
+) -> Dataset:
+    """Run a plan, made for the manifest as it is on disk, until there is nothing left of it, and keep the books.
+
     Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
     the dataset is whole in either case.
     """
     log = folder / "failures.log"
     try:
-        manifest = begin(folder, manifest_for(recipe, tasks))
+        manifest = begin(folder, manifest)
         log.unlink(missing_ok=True)
     except OSError as error:
         raise _storage_error(folder, error) from error
     work = partial(run_unit, recipe.model_dump_json(), manifest.settings_digest, folder)
     try:
         with start_engine(work) as engine:
-            failures = _run_all(engine, dict.fromkeys(tasks, recipe.episodes), recipe.first_seed, folder, share, report)
+            failures = run_all(engine, plan_for(manifest), folder, share, report)
         dataset = summarise(folder)
     except OSError as error:
         raise _storage_error(folder, error) from error
@@ -130,25 +143,20 @@ def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int)
     }
 
 
-def _run_all(
-    engine: Engine,
-    wanted: Mapping[str, int],
-    first_seed: int,
-    folder: Path,
-    share: Share,
-    report: Callable[[Progress], None],
+def run_all(
+    engine: Engine, plan: Plan, folder: Path, share: Share, report: Callable[[Progress], None]
 ) -> list[Outcome]:
-    """Submit units and collect outcomes until nothing is left that this run could do."""
+    """Submit units and collect outcomes until nothing is left that this run could do; returns the failures."""
     receipts = _receipts_by_unit(folder)
     under_way: dict[str, WorkUnit] = {}
     failures: list[Outcome] = []
     next_summary = time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
     while True:
         taken = [*under_way.values(), *(f.unit for f in failures)]
-        for unit in _plan(wanted, first_seed, receipts.values(), taken, share):
+        for unit in plan.next_units(receipts.values(), taken, share):
             under_way[unit.name] = unit
             engine.submit(unit)
-        report(_progress(wanted, receipts.values()))
+        report(plan.progress(receipts.values()))
         if not under_way:
             seen, receipts = receipts.keys(), _receipts_by_unit(folder)
             if receipts.keys() == seen:  # otherwise jobs beside this one went on: is there more to do now?
@@ -164,32 +172,6 @@ def _run_all(
             start = time.monotonic()
             summarise(folder)
             next_summary = time.monotonic() + max(_SECONDS_BETWEEN_SUMMARIES, 20 * (time.monotonic() - start))
-
-
-def _plan(
-    wanted: Mapping[str, int], first_seed: int, receipts: Iterable[Receipt], taken: list[WorkUnit], share: Share
-) -> Iterator[WorkUnit]:
-    """The units to submit now. ``taken`` are under way or given up: their seeds are not for anyone else."""
-    tried: dict[str, set[int]] = {task: set() for task in wanted}
-    sure = dict.fromkeys(wanted, 0)
-    for receipt in receipts:
-        if receipt.task in wanted:
-            tried[receipt.task].update(receipt.seeds)
-            sure[receipt.task] += len(receipt.accepted)
-    for unit in taken:
-        tried[unit.task].update(unit.seeds)
-        sure[unit.task] += len(unit.seeds)
-    for task, episodes in wanted.items():
-        yield from next_units(task, episodes, first_seed, tried[task], sure[task], share)
-
-
-def _progress(wanted: Mapping[str, int], receipts: Iterable[Receipt]) -> Progress:
-    accepted, rejected = dict.fromkeys(wanted, 0), 0
-    for receipt in receipts:
-        if receipt.task in wanted:
-            accepted[receipt.task] += len(receipt.accepted)
-            rejected += len(receipt.rejects)
-    return Progress(sum(min(accepted[t], n) for t, n in wanted.items()), sum(wanted.values()), rejected)
 
 
 def _receipts_by_unit(folder: Path) -> dict[str, Receipt]:

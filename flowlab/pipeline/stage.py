@@ -12,7 +12,14 @@ from flowlab.storage.manifest import StageTally
 
 
 class Rejected(Exception):
-    """Raised by a stage that will not let a record pass; the message is the reason that is kept."""
+    """Raised by a stage that will not let a record pass; the message is the reason that is kept.
+
+    A stage that gives the episode too keeps it for people to look at.
+    """
+
+    def __init__(self, *about: str, episode: Episode | None = None) -> None:
+        super().__init__(*about)
+        self.episode = episode
 
 
 class Stage(Settings):
@@ -55,6 +62,8 @@ class EpisodeRequest(Settings):
 
     task: str
     seed: int
+    source: str = ""
+    """Path of the recording that the seed stands for; empty for simulation."""
 
 
 class Writer(Stage):
@@ -101,7 +110,7 @@ class Pipeline:
             return stage.process(record)
         except Rejected as rejected:
             rejects = 1
-            raise Rejected(stage.stage, str(rejected)) from rejected
+            raise Rejected(stage.stage, str(rejected), episode=rejected.episode) from rejected
         finally:
             self._count(stage, StageTally(calls=1, cpu_s=time.process_time() - start, rejects=rejects))
 

@@ -1,10 +1,10 @@
-"""Work units: which seeds are tried next, and by whom."""
+"""Work units: some seeds each, and who does them."""
 
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from flowlab.config import Settings
 from flowlab.errors import UsageError
+from flowlab.pipeline.stage import EpisodeRequest
 
 
 class WorkUnit(Settings):
@@ -12,6 +12,14 @@ class WorkUnit(Settings):
 
     task: str
     seeds: tuple[int, ...]
+    sources: tuple[str, ...] = ()
+    """Path of the recording that each seed stands for; empty for simulation."""
+
+    @property
+    def requests(self) -> list[EpisodeRequest]:
+        """What the pipeline is asked for, seed by seed."""
+        sources = self.sources or ("",) * len(self.seeds)
+        return [EpisodeRequest(task=self.task, seed=s, source=x) for s, x in zip(self.seeds, sources, strict=True)]
 
     @property
     def name(self) -> str:
@@ -34,38 +42,3 @@ class Share:
         if not (slash and index.isdigit() and count.isdigit() and int(index) < int(count)):
             raise UsageError(f"--shard {text}: must be i/n with i from 0 to n-1, as in --shard 0/4")
         return cls(int(index), int(count))
-
-
-def unit_size(episodes: int) -> int:
-    """Seeds to a unit: enough units for many workers, few enough that writing them costs little.
-
-    It depends on the request alone, never on the workers, so that the shards are the same everywhere.
-    """
-    return max(2, min(16, episodes // 16))
-
-
-def next_units(
-    task: str, wanted: int, first_seed: int, tried: Collection[int], accepted: int, share: Share
-) -> Sequence[WorkUnit]:
-    """The units to start now so that the first ``wanted`` successful seeds, in order, get accepted.
-
-    ``tried`` holds the seeds done or under way; of the latter every one counts in ``accepted`` until it
-    fails. The first ``wanted`` seeds go out in units of fixed composition; after that each failure is
-    made good by the next seed, alone, so that timing does not decide what shares a shard.
-    """
-    size = unit_size(wanted)
-    first_round = range(first_seed, first_seed + wanted)
-    units = []
-    for k, start in enumerate(range(first_round.start, first_round.stop, size)):
-        seeds = tuple(s for s in range(start, min(start + size, first_round.stop)) if s not in tried)
-        if seeds:
-            units.append((k, WorkUnit(task=task, seeds=seeds)))
-    if units:
-        return [unit for k, unit in units if k % share.count == share.index]
-    seed = first_round.stop
-    replacements: list[WorkUnit] = []
-    while accepted + len(replacements) < wanted:
-        if seed not in tried:
-            replacements.append(WorkUnit(task=task, seeds=(seed,)))
-        seed += 1
-    return replacements

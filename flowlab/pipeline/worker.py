@@ -1,12 +1,14 @@
 """A worker's side of an extraction: one unit, from its seeds to its shard and receipt."""
 
 import resource
+import shutil
 from functools import lru_cache
 from pathlib import Path
 
 from flowlab.pipeline.recipe import parse_recipe
-from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected
+from flowlab.pipeline.stage import Pipeline, Rejected
 from flowlab.pipeline.units import WorkUnit
+from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.dataset import keep_receipt
 from flowlab.storage.manifest import Receipt, Reject
@@ -17,15 +19,22 @@ def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUni
     """Make the episodes of a unit, write them into its shard, and its receipt beside them."""
     pipeline = _pipeline(recipe_json)
     before = dict(pipeline.tallies)
-    episodes, rejects = [], []
-    for seed in unit.seeds:
+    episodes: list[Episode] = []
+    rejects: list[Reject] = []
+    kept: list[Episode] = []
+    for request in unit.requests:
         try:
-            episodes.append(pipeline.run(EpisodeRequest(task=unit.task, seed=seed)))
+            episodes.append(pipeline.run(request))
         except Rejected as rejected:
             stage, reason = rejected.args
-            rejects.append(Reject(task=unit.task, seed=seed, stage=stage, reason=reason))
-    if episodes:
-        pipeline.store(folder / "shards" / f"{unit.name}.zarr", episodes, settings_digest)
+            position = None
+            if rejected.episode is not None:
+                position = len(kept)
+                kept.append(pipeline.writer.process(rejected.episode))
+            about = request.model_dump()
+            rejects.append(Reject(**about, stage=stage, reason=reason, position=position))
+    for place, found in ("shards", episodes), ("rejects", kept):
+        _store(pipeline, folder / place / f"{unit.name}.zarr", found, settings_digest)
     receipt = Receipt(
         unit=unit.name,
         task=unit.task,
@@ -40,6 +49,14 @@ def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUni
     )
     keep_receipt(folder, receipt)
     return receipt
+
+
+def _store(pipeline: Pipeline, path: Path, episodes: list[Episode], settings_digest: str) -> None:
+    """Write a shard; where there is nothing to write, remove what an earlier try at the unit has left."""
+    if episodes:
+        pipeline.store(path, episodes, settings_digest)
+    else:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 @lru_cache(maxsize=1)

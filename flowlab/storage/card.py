@@ -15,18 +15,24 @@ tags: [robotics, point-cloud, 3d-flow, flowlab]
 
 `flowlab info` shows more, `flowlab validate` checks it, `flowlab viz --episode 0` draws it.
 
-| task | episodes | frames | rejected seeds |
+| task | episodes | frames | rejected |
 |---|---|---|---|
 {tasks}
 
 Motion: {still:.0%} of all point steps are still (< 0.1 mm); {moving:.0%} of the query points move more
 than 1 cm in their episode; the 95th percentile of a step is {p95:.2g} mm.
-
+{quality}
 ## Arrays of a shard
 
 `shards/*.zarr` are zarr v3 groups of whole episodes; `{ends}` gives the row after each episode's last.
 
 {arrays}
+"""
+
+_QUALITY = """
+Tracks are estimated from pictures, by the tracker `{tracker}`; every position states its error as `data/sigma`.
+Of visible points it is {p50:.2g} mm in the median and {p90:.2g} mm at the 90th percentile. {visible:.0%} of all
+positions are visible; {shares}.
 """
 
 
@@ -48,8 +54,21 @@ def dataset_card(manifest: Manifest, receipts: Sequence[Receipt], stats: dict[st
         still=stats["motion"]["still_share"],
         moving=stats["motion"]["moving_point_share"],
         p95=stats["motion"]["step_m"]["p95"] * 1e3,
+        quality=_quality(manifest, stats["quality"]) if "quality" in stats else "",
         ends=EPISODE_ENDS,
         arrays=schema_table(),
+    )
+
+
+def _quality(manifest: Manifest, quality: dict[str, Any]) -> str:
+    """What the card says of tracks that were estimated."""
+    sigma = quality["visible_sigma_m"]
+    return _QUALITY.format(
+        tracker=manifest.settings.get("track", {}).get("tracker", "unknown"),
+        p50=sigma["p50"] * 1e3,
+        p90=sigma["p90"] * 1e3,
+        visible=quality["visible_share"],
+        shares=", ".join(f"{share:.0%} are {source}" for source, share in quality["source_share"].items()),
     )
 
 

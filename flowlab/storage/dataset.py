@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,8 +13,9 @@ from flowlab.errors import DataError
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
-from flowlab.storage.files import remove_leftovers, write_json, write_whole
+from flowlab.storage.files import locked, remove_leftovers, write_json, write_whole
 from flowlab.storage.manifest import MANIFEST, Manifest, Receipt, differences, read_receipts
+from flowlab.storage.recorded import number_recordings
 from flowlab.storage.shard import Shard
 
 
@@ -27,6 +29,22 @@ class EpisodeRef:
     shard: str
     """Path below the dataset."""
     position: int
+    """Index within the shard."""
+
+
+@dataclass(frozen=True, slots=True)
+class RejectRef:
+    """What was kept out of a dataset, and where its episode lies if there is one to look at."""
+
+    task: str
+    seed: int
+    stage: str
+    reason: str
+    source: str
+    """Path of the recording; empty for simulation."""
+    shard: str | None
+    """Path below the dataset; None where no episode could be made."""
+    position: int | None
     """Index within the shard."""
 
 
@@ -69,6 +87,33 @@ class Dataset:
                 yield from Shard(self.path / receipt.shard).episodes()
 
     @cached_property
+    def rejects(self) -> list[RejectRef]:
+        """What was tried and kept out, in order of task and seed."""
+        return sorted(
+            (
+                RejectRef(
+                    x.task, x.seed, x.stage, x.reason, x.source,
+                    None if x.position is None else r.rejects_shard, x.position,
+                )
+                for r in self.receipts
+                for x in r.rejects
+            ),
+            key=lambda ref: (ref.task, ref.seed),
+        )  # fmt: skip
+
+    def rejected(self, index: int) -> Episode:
+        """The episode at a position of :attr:`rejects`, where there is one to look at."""
+        if not 0 <= index < len(self.rejects):
+            raise DataError(f"{self.path}: no reject {index}; there are {len(self.rejects)}, counted from 0")
+        ref = self.rejects[index]
+        if ref.shard is None or ref.position is None:
+            raise DataError(
+                f"{self.path}: {ref.task} seed {ref.seed} was rejected at {ref.stage} ({ref.reason}), "
+                "before there was an episode to look at"
+            )
+        return Shard(self.path / ref.shard).episode(ref.position)
+
+    @cached_property
     def stats(self) -> dict[str, Any]:
         """Limits, mean and deviation of every array, and how much moves."""
         return stats.describe(stats.merge(dict(r.stats) for r in self.receipts if r.accepted))
@@ -83,7 +128,13 @@ class Dataset:
 
     @property
     def missing(self) -> dict[str, int]:
-        """Episodes still to be made, by task; empty when the dataset is complete."""
+        """Episodes still to be made, by task; empty when the dataset is complete.
+
+        Of recordings, those not yet looked at: what was rejected is done with.
+        """
+        if self.manifest.recordings:
+            done = {(r.task, seed) for r in self.receipts for seed in r.seeds}
+            return dict(Counter(r.task for r in self.manifest.recordings if (r.task, r.seed) not in done))
         have: dict[str, int] = {}
         for r in self.receipts:
             have[r.task] = have.get(r.task, 0) + len(r.accepted)
@@ -101,26 +152,44 @@ def begin(folder: Path, manifest: Manifest) -> Manifest:
         (folder / "receipts").mkdir(exist_ok=True)
     except (PermissionError, NotADirectoryError, FileExistsError) as error:
         raise DataError(f"{folder}: cannot make a dataset here ({error.strerror}); choose another --out") from error
-    if (folder / MANIFEST).exists():
-        old = Manifest.read(folder)
-        # Through JSON, so that tuples and lists compare as they are stored.
-        mine = json.loads(manifest.model_dump_json())
-        theirs = json.loads(old.model_dump_json())
-        for values in (theirs, mine):
-            values["stages"] = list(values["settings"])
-        compared = ("stages", "settings", "first_seed", "camera")
-        lines = list(differences({k: theirs[k] for k in compared}, {k: mine[k] for k in compared}))
-        if lines:
-            raise DataError(
-                f"{folder}: made with other settings, and one dataset has one setting. "
-                f"Choose another --out, or the same settings:\n  " + "\n  ".join(lines)
-            )
-        requested = {t: max(n, manifest.requested.get(t, 0)) for t, n in old.requested.items()}
-        manifest = old.model_copy(update={"requested": {**manifest.requested, **requested}})
-    write_json(folder / MANIFEST, json.loads(manifest.model_dump_json()))
-    for place in (folder, folder / "shards", folder / "receipts"):
+    with locked(folder):
+        manifest = _joined(folder, manifest)
+        write_json(folder / MANIFEST, json.loads(manifest.model_dump_json()))
+    for place in (folder, folder / "shards", folder / "receipts", folder / "rejects"):
         remove_leftovers(place)
     return manifest
+
+
+def _joined(folder: Path, manifest: Manifest) -> Manifest:
+    """The manifest of a folder that may have one, now asking for what ``manifest`` asks for too."""
+    joined, known = manifest, manifest.recordings[:0]
+    if (folder / MANIFEST).exists():
+        old = Manifest.read(folder)
+        _check_settings(folder, old, manifest)
+        known = old.recordings
+        requested = {t: max(n, manifest.requested.get(t, 0)) for t, n in old.requested.items()}
+        joined = old.model_copy(update={"requested": {**manifest.requested, **requested}})
+    if manifest.recordings:
+        recordings = number_recordings(known, manifest.recordings)
+        requested = dict(Counter(r.task for r in recordings))
+        joined = joined.model_copy(update={"recordings": recordings, "requested": requested})
+    return joined
+
+
+def _check_settings(folder: Path, old: Manifest, manifest: Manifest) -> None:
+    """Refuse a dataset that was made with other settings."""
+    # Through JSON, so that tuples and lists compare as they are stored.
+    mine = json.loads(manifest.model_dump_json())
+    theirs = json.loads(old.model_dump_json())
+    for values in (theirs, mine):
+        values["stages"] = list(values["settings"])
+    compared = ("stages", "settings", "first_seed", "camera")
+    lines = list(differences({k: theirs[k] for k in compared}, {k: mine[k] for k in compared}))
+    if lines:
+        raise DataError(
+            f"{folder}: made with other settings, and one dataset has one setting. "
+            f"Choose another --out, or the same settings:\n  " + "\n  ".join(lines)
+        )
 
 
 def keep_receipt(folder: Path, receipt: Receipt) -> None:
@@ -132,7 +201,7 @@ def summarise(folder: Path) -> Dataset:
     """Write what follows from the receipts: statistics, rejects and the dataset card."""
     dataset = Dataset(folder)
     write_json(folder / "stats.json", dataset.stats)
-    rejects = [x.model_dump_json() + "\n" for r in dataset.receipts for x in r.rejects]
+    rejects = [x.model_dump_json(exclude_defaults=True) + "\n" for r in dataset.receipts for x in r.rejects]
     write_whole(folder / "rejects.jsonl", "".join(rejects))
     write_whole(folder / "README.md", dataset_card(dataset.manifest, dataset.receipts, dataset.stats))
     return dataset

@@ -12,6 +12,7 @@ from flowlab import __version__
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.storage.files import read_json
+from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
 
 MANIFEST = "flowlab.json"
@@ -33,12 +34,14 @@ class Manifest(Settings):
     settings: Mapping[str, Any]
     """Every setting of every stage, by stage name."""
     camera: Mapping[str, Any]
-    """K [px] and T_world_cam, see :class:`flowlab.geometry.Camera`."""
+    """K [px] and T_world_cam, see :class:`flowlab.geometry.Camera`; empty where every recording has its own."""
     world_frame: str
     units: Mapping[str, str] = UNITS
     first_seed: int
     requested: Mapping[str, int]
     """Episodes asked for, by task."""
+    recordings: tuple[Recorded, ...] = ()
+    """What the episodes are made from, where that is no simulation."""
 
     @property
     def settings_digest(self) -> str:
@@ -68,12 +71,16 @@ class Manifest(Settings):
 
 
 class Reject(Settings):
-    """A seed that gave no episode."""
+    """A seed, or a recording, that gave no episode, or none that is good enough."""
 
     task: str
     seed: int
     stage: str
     reason: str
+    source: str = ""
+    """Path of the recording."""
+    position: int | None = None
+    """Index of the episode within the shard of its unit's rejects; None where there is nothing to look at."""
 
 
 class StageTally(Settings):
@@ -126,6 +133,11 @@ class Receipt(Settings):
     def shard(self) -> str:
         """Path of the shard below the dataset."""
         return f"shards/{self.unit}.zarr"
+
+    @property
+    def rejects_shard(self) -> str:
+        """Path below the dataset of the shard that keeps rejected episodes, where there are any to keep."""
+        return f"rejects/{self.unit}.zarr"
 
 
 def read_receipts(folder: Path) -> list[Receipt]:

@@ -1,11 +1,11 @@
 """What a shard holds: every array by name, with its dimensions, type, unit and meaning."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from flowlab.records import Episode
+from flowlab.records import Episode, Quality
 
 SCHEMA_VERSION = 1
 
@@ -36,6 +36,14 @@ class ArraySpec:
 
 def _row(value: object, dtype: str) -> np.ndarray:
     return np.asarray(value, dtype)[None]
+
+
+def _quality(name: str, dtype: str, unit: str, meaning: str) -> ArraySpec:
+    """An array of :class:`~flowlab.records.Quality`, which exact tracks lack."""
+    return ArraySpec(
+        f"data/{name}", dtype, ("time", "query"), unit, meaning,
+        lambda e: None if e.tracks.quality is None else getattr(e.tracks.quality, name), optional=True,
+    )  # fmt: skip
 
 
 SCHEMA = (
@@ -77,6 +85,23 @@ SCHEMA = (
         lambda e: e.depth, optional=True,
     ),
     ArraySpec("data/rgb", "uint8", ("time", "v", "u", "rgb"), "1", "colour picture", lambda e: e.rgb, optional=True),
+    _quality("sigma", "float32", "m", "stated error of the position: 68 % of errors are meant to be below it"),
+    _quality(
+        "source", "uint8", "1", "where the position comes from: 1 measured, 2 carried by a fitted motion, 3 filled in"
+    ),
+    _quality("depth_valid", "bool", "1", "whether the sensor gave a depth at the point's pixel that fits the point"),
+    _quality(
+        "forward_backward", "float32", "px",
+        "how far the point lands from its start when tracked there and back; -1 where not measured",
+    ),
+    _quality(
+        "disagreement", "float32", "px",
+        "how far apart overlapping chunks put the point; -1 where only one chunk covers it",
+    ),
+    _quality(
+        "residual", "float32", "1",
+        "how badly the fitted motion explains colour and depth around the point, 0 to 1; -1 where there is none",
+    ),
     ArraySpec("meta/seed", "int64", ("episode",), "1", "seed of the episode", lambda e: _row(e.seed, "int64")),
     ArraySpec(
         "meta/success", "bool", ("episode",), "1", "whether the task was solved at any step",
@@ -106,5 +131,7 @@ SCHEMA = (
         lambda e: _row(e.tracks.association_distance, "float32"),
     ),
 )  # fmt: skip
+QUALITY = tuple(f"data/{name.name}" for name in fields(Quality))
+"""The arrays of :class:`~flowlab.records.Quality`: all of them or none."""
 EPISODE_ENDS = "meta/episode_ends"
 """int64 (episode,): the row after each episode's last; written beside the arrays of the schema."""

@@ -18,9 +18,9 @@ from zarr.storage import MemoryStore
 
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
-from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
+from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
 from flowlab.storage.files import temporary_path
-from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION, ArraySpec
+from flowlab.storage.schema import EPISODE_ENDS, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
 
 STEPS_PER_CHUNK = 256
 """A chunk holds at most this many rows; most episodes are one chunk per array."""
@@ -71,7 +71,8 @@ def episode_digest(episode: Episode) -> str:
     for spec in SCHEMA:
         values = spec.of(episode)
         if values is not None:
-            digest.update(f"{spec.path} {values.shape}".encode() + np.ascontiguousarray(values, spec.dtype).tobytes())
+            digest.update(f"{spec.path} {values.shape}".encode())
+            digest.update(np.ascontiguousarray(values, spec.dtype).data)
     return digest.hexdigest()
 
 
@@ -91,6 +92,11 @@ class Shard:
 
     def __len__(self) -> int:
         return len(self.attributes["episodes"])
+
+    def about(self, k: int) -> Mapping[str, Any]:
+        """The ``extras`` of the k-th episode."""
+        extras: Mapping[str, Any] = self.attributes["episodes"][k]["extras"]
+        return extras
 
     def array(self, spec_path: str, rows: slice | int | EllipsisType = ...) -> np.ndarray:
         """An array, or some rows of it; a missing or damaged chunk is an error, never silent zeros."""
@@ -121,6 +127,11 @@ class Shard:
         """Whether the shard holds an array."""
         return (self.path / spec.path).exists()
 
+    def specs(self) -> list[ArraySpec]:
+        """The arrays that the shard holds, or must hold."""
+        estimated = any((self.path / path).exists() for path in QUALITY)
+        return [s for s in SCHEMA if self.has(s) or not s.optional or (estimated and s.path in QUALITY)]
+
     def describe(self) -> list[dict[str, Any]]:
         """Name, dimensions, shape, type and unit of every array."""
         paths = [*(s.path for s in SCHEMA if self.has(s)), EPISODE_ENDS]
@@ -143,17 +154,14 @@ class Shard:
 
     def episodes(self) -> Iterator[Episode]:
         """Every episode of the shard."""
-        columns = {s.path: self.array(s.path) for s in SCHEMA if self.has(s) or not s.optional}
+        columns = {s.path: self.array(s.path) for s in self.specs()}
         for k, rows in enumerate(self.rows()):
             yield self._episode(k, {p: a[rows] if p.startswith("data/") else a[k] for p, a in columns.items()})
 
     def episode(self, k: int) -> Episode:
         """The k-th episode; reads only its chunks."""
         rows = self.rows()[k]
-        columns = {}
-        for spec in SCHEMA:
-            if self.has(spec) or not spec.optional:
-                columns[spec.path] = self.array(spec.path, rows if spec.per_step else k)
+        columns = {s.path: self.array(s.path, rows if s.per_step else k) for s in self.specs()}
         return self._episode(k, columns)
 
     def _episode(self, k: int, columns: Mapping[str, np.ndarray]) -> Episode:
@@ -172,12 +180,20 @@ class Shard:
             queries=Queries(
                 columns["meta/query_xyz"], columns["meta/query_owner"], int(columns["meta/query_count"]), entities
             ),
-            tracks=Tracks3D(columns["data/tracks"], columns["data/visible"], columns["meta/association_distance"]),
+            tracks=Tracks3D(
+                columns["data/tracks"], columns["data/visible"], columns["meta/association_distance"], _quality(columns)
+            ),
             object_pose=columns.get("data/object_pose"),
             depth=columns.get("data/depth"),
             rgb=columns.get("data/rgb"),
             extras=about["extras"],
         )
+
+
+def _quality(columns: Mapping[str, np.ndarray]) -> Quality | None:
+    if not any(path in columns for path in QUALITY):
+        return None
+    return Quality(**{path.removeprefix("data/"): columns[path] for path in QUALITY})
 
 
 _REDO = "delete the unit's receipt and run the same extract command again to make it anew"
@@ -216,7 +232,8 @@ def _encode(episodes: Sequence[Episode], settings_digest: str) -> dict[str, byte
     for spec in SCHEMA:
         parts = [part for e in episodes if (part := spec.of(e)) is not None]
         if parts:  # all of them, or an optional array that none has
-            _write(group, spec.path, np.concatenate(parts).astype(spec.dtype), spec.dims, spec.unit, spec.meaning)
+            whole = np.concatenate(parts) if len(parts) > 1 else parts[0]  # pictures are large
+            _write(group, spec.path, whole.astype(spec.dtype, copy=False), spec.dims, spec.unit, spec.meaning)
     ends = np.cumsum([len(e) for e in episodes], dtype=np.int64)
     _write(group, EPISODE_ENDS, ends, ("episode",), "1", "the row after each episode's last")
     return {name: content.to_bytes() for name, content in store.items()}

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from flowlab.records import Episode
+from flowlab.records import Episode, Quality, Source
 
 STILL = 1e-4
 """A query point that moves less than this in one step [m] counts as still."""
@@ -22,7 +22,8 @@ _CHANNELS: dict[str, Callable[[Episode], np.ndarray | None]] = {
 
 Summary = dict[str, Any]
 """JSON values. ``arrays`` maps a name to count, min, max, mean and m2 per channel; ``steps`` holds the
-histogram of step lengths; further numbers are sums."""
+histogram of step lengths, ``quality`` (of estimated tracks only) that of stated errors and how many positions
+come from where; further numbers are sums."""
 
 
 def summarise(episodes: Iterable[Episode]) -> Summary:
@@ -43,6 +44,8 @@ def merge(parts: Iterable[Summary]) -> Summary:
         for name, new in part["arrays"].items():
             old = total["arrays"].get(name)
             total["arrays"][name] = new if old is None else _merge_moments(old, new)
+        if "quality" in part:
+            total["quality"] = _merge_sums(total.get("quality", {}), part["quality"])
     total["steps"] = total["steps"].tolist()
     return total
 
@@ -66,20 +69,47 @@ def describe(summary: Summary) -> dict[str, Any]:
         "moving_point_share": summary["moving_points"] / max(summary["points"], 1),
         "step_m": {f"p{q}": _quantile(steps, q / 100) for q in (50, 90, 95, 99)},
     }
-    return {"episodes": summary["episodes"], "frames": summary["frames"], "arrays": arrays, "motion": motion}
+    about = {"episodes": summary["episodes"], "frames": summary["frames"], "arrays": arrays, "motion": motion}
+    return about | ({"quality": _describe_quality(summary["quality"])} if "quality" in summary else {})
 
 
 def _of_episode(e: Episode) -> Summary:
     step = np.linalg.norm(e.flow[:-1], axis=-1)
     travelled = np.linalg.norm(e.tracks.xyz_world - e.tracks.xyz_world[0], axis=-1).max(0)
     arrays = {name: take(e) for name, take in _CHANNELS.items()}
-    return {
+    quality = {} if e.tracks.quality is None else {"quality": _of_quality(e.tracks.quality, e.tracks.visible)}
+    return quality | {
         "episodes": 1,
         "frames": len(e),
         "points": travelled.size,
         "moving_points": int((travelled > 0.01).sum()),
         "steps": np.histogram(step, _BINS)[0].tolist(),
         "arrays": {name: _moments(a) for name, a in arrays.items() if a is not None and a.size},
+    }
+
+
+def _of_quality(quality: Quality, visible: np.ndarray) -> dict[str, list[int]]:
+    """Sums over all points and steps: histograms of sigma, and positions by source."""
+    return {
+        "sigma": np.histogram(quality.sigma, _BINS)[0].tolist(),
+        "sigma_visible": np.histogram(quality.sigma[visible], _BINS)[0].tolist(),
+        "source": [int((quality.source == s).sum()) for s in Source],
+    }
+
+
+def _merge_sums(a: Mapping[str, list[int]], b: Mapping[str, list[int]]) -> dict[str, list[int]]:
+    return {name: np.add(a.get(name, 0), values).tolist() for name, values in b.items()}
+
+
+def _describe_quality(sums: Mapping[str, list[int]]) -> dict[str, Any]:
+    """Quantiles of sigma [m], the share of visible positions, and the share that comes from each source."""
+    sigma, visible, source = (np.array(sums[name]) for name in ("sigma", "sigma_visible", "source"))
+    total = max(int(sigma.sum()), 1)
+    return {
+        "sigma_m": {f"p{q}": _quantile(sigma, q / 100) for q in (50, 90, 95)},
+        "visible_sigma_m": {f"p{q}": _quantile(visible, q / 100) for q in (50, 90, 95)},
+        "visible_share": int(visible.sum()) / total,
+        "source_share": {s.name.lower(): int(source[s]) / total for s in Source if s is not Source.SIMULATOR},
     }
 
 

@@ -1,0 +1,152 @@
+"""What can be wrong with the content of an episode."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from flowlab.records import Episode, Source
+from flowlab.storage.schema import SCHEMA
+
+TELEPORT = 0.15
+"""A query point that moves more than this in one step [m] is wrong; the fastest of all 50 tasks, the
+faucet's handle, moves half as far."""
+OFF_SURFACE = 0.03
+"""A visible point this much farther from the cloud [m] than the cloud is coarse lies on no surface."""
+OFF_SURFACE_SHARE = 0.02
+"""Share of an episode's visible points that may do so: pixels at silhouettes show what is behind."""
+FASTEST = 3.0
+"""An estimated point that is faster than this [m/s], and jumps farther than its stated errors explain, is wrong."""
+JUMPING_SHARE = 0.01
+"""Share of an episode's estimated steps that may do so: trackers err."""
+OFF_SURFACE_SHARE_ESTIMATED = 0.05
+"""The same of estimated tracks: sensors err too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something wrong with one array."""
+
+    array: str
+    """Its path in the shard."""
+    what: str
+
+
+def episode_problems(e: Episode, settings: Mapping[str, Any]) -> Iterator[Problem]:
+    """Everything wrong with an episode that was made with these settings."""
+    for spec in SCHEMA:
+        values = spec.of(e) if spec.dtype.startswith("float") else None
+        if values is not None and not np.isfinite(values).all():
+            row = int(np.argwhere(~np.isfinite(values))[0][0])
+            yield Problem(spec.path, f"not finite at step {row}" if spec.per_step else "not finite")
+            return
+    for check in _CHECKS:
+        yield from check(e)
+    if "track" in settings and e.tracks.quality is None:
+        yield Problem("data/sigma", "missing; estimated tracks must state their error")
+    if "expert" in settings and np.abs(e.action).max() > 1:
+        yield Problem("data/action", f"reaches {np.abs(e.action).max():.3g}; actions as executed lie in [-1, 1]")
+
+
+def _teleports(e: Episode) -> Iterator[Problem]:
+    step = np.linalg.norm(e.flow[:-1], axis=-1)
+    if e.tracks.quality is not None:
+        yield from _estimated_teleports(e, step)
+    elif step.size and step.max() > TELEPORT:
+        t, m = np.unravel_index(step.argmax(), step.shape)
+        yield Problem(
+            "data/tracks", f"point {m} jumps {step.max():.3f} m after step {t}; at most {TELEPORT} is possible"
+        )
+
+
+def _estimated_teleports(e: Episode, step: np.ndarray) -> Iterator[Problem]:
+    """Only points that were followed through a step can jump in it; one that comes back from hiding may be anywhere."""
+    quality = e.tracks.quality
+    assert quality is not None
+    known = e.tracks.visible & (quality.source != Source.FILLED)
+    known = known[1:] & known[:-1]
+    possible = np.maximum(TELEPORT, FASTEST * np.diff(e.time_s))[:, None]
+    far = known & (step > possible + 3 * (quality.sigma[1:] + quality.sigma[:-1]))
+    if far.sum() > JUMPING_SHARE * known.sum():
+        t, m = np.unravel_index(np.where(far, step, 0).argmax(), step.shape)
+        yield Problem(
+            "data/tracks",
+            f"{far.sum()} of {known.sum()} steps of visible points are jumps that their stated errors do not explain; "
+            f"the farthest, of point {m} after step {t}, is {step[t, m]:.3f} m",
+        )
+
+
+def _quality(e: Episode) -> Iterator[Problem]:
+    """Estimated tracks state an error, and claim to be measured only where something was."""
+    quality = e.tracks.quality
+    if quality is None:
+        return
+    measured = quality.source == Source.MEASURED
+    wrong = {
+        "sigma": (quality.sigma <= 0, "states an error that is not above 0"),
+        "source": ((quality.source < Source.MEASURED) | (quality.source > Source.FILLED), "has a source that is none"),
+        "visible": (measured & ~e.tracks.visible, "is measured, yet not visible"),
+        "depth_valid": (
+            measured & e.tracks.visible & ~quality.depth_valid,
+            "is measured, yet the sensor gave no depth",
+        ),
+    }
+    for name in ("forward_backward", "disagreement", "residual"):
+        values = getattr(quality, name)
+        wrong[name] = ((values < 0) & (values != -1), "is below 0, and not the -1 that stands for unknown")
+    for name, (where, what) in wrong.items():
+        if where.any():
+            t, m = np.argwhere(where)[0]
+            yield Problem(f"data/{name}", f"point {m} at step {t} {what}, and so are {where.sum() - 1} more")
+
+
+def _times(e: Episode) -> Iterator[Problem]:
+    if not (np.diff(e.time_s) > 0).all():
+        yield Problem("data/time", f"does not rise after step {int((np.diff(e.time_s) <= 0).argmax())}")
+
+
+def _counts(e: Episode) -> Iterator[Problem]:
+    n = e.point_cloud.shape[1]
+    if not ((e.point_count >= 1) & (e.point_count <= n)).all():
+        yield Problem("data/point_count", f"ranges from {e.point_count.min()} to {e.point_count.max()}, not 1 to {n}")
+
+
+def _anchors(e: Episode) -> Iterator[Problem]:
+    gap = np.abs(np.linalg.norm(e.tracks.xyz_world[0] - e.queries.xyz_world, axis=-1) - e.tracks.association_distance)
+    if gap.max() > 1e-4:
+        yield Problem("data/tracks", f"point {gap.argmax()} starts {gap.max() * 1e3:.2f} mm from where it was anchored")
+
+
+def _off_surface(e: Episode) -> Iterator[Problem]:
+    """Visible points must lie on the cloud, as far as a sampled cloud can tell.
+
+    A farthest-point sample leaves no point of its cloud farther away than its own least spacing, so a
+    visible point, which is within a pixel of the cloud, is that near to the sample; unless it has left
+    the crop, which the cloud's extent tells. Estimated points may be off by as much as they say.
+    """
+    far = total = 0
+    quality = e.tracks.quality
+    known = e.tracks.visible if quality is None else e.tracks.visible & (quality.source != Source.FILLED)
+    slack = np.zeros(known.shape, np.float32) if quality is None else 2 * quality.sigma
+    for t in range(0, len(e), 4):
+        cloud = e.point_cloud[t, : e.point_count[t]]
+        xyz = e.tracks.xyz_world[t]
+        inside = known[t] & ((xyz > cloud.min(0)) & (xyz < cloud.max(0))).all(1)
+        seen = xyz[inside]
+        if len(cloud) < 2 or len(seen) == 0:
+            continue
+        tree = cKDTree(cloud)
+        spacing = np.asarray(tree.query(cloud, k=2)[0])[:, 1].min()
+        distance = np.asarray(tree.query(seen)[0]) - e.tracks.association_distance.max() - slack[t, inside]
+        far, total = far + int((distance > spacing + OFF_SURFACE).sum()), total + len(seen)
+    if far > (OFF_SURFACE_SHARE if quality is None else OFF_SURFACE_SHARE_ESTIMATED) * total:
+        yield Problem(
+            "data/tracks", f"{far} of {total} visible points lie off the surface; the labels do not fit the cloud"
+        )
+
+
+_CHECKS: tuple[Callable[[Episode], Iterator[Problem]], ...] = (
+    _times, _teleports, _quality, _counts, _anchors, _off_surface,
+)  # fmt: skip
