@@ -26,8 +26,12 @@ def two_plates() -> list[plates.Plate]:
     """One slides to the right and turns; one comes nearer, tilting."""
     return [
         plates.wall(1.2, FRAMES),
-        plates.moving((0.22, 0.26), (-0.2, -0.12, 0.8), np.array([0.008, 0.002, 0]), np.array([0, 0, 0.015]), FRAMES, 1),
-        plates.moving((0.24, 0.22), (0.2, 0.15, 0.9), np.array([-0.002, 0, -0.007]), np.array([0, 0.012, 0]), FRAMES, 2),
+        plates.moving(
+            (0.22, 0.26), (-0.2, -0.12, 0.8), np.array([0.008, 0.002, 0]), np.array([0, 0, 0.015]), FRAMES, 1
+        ),
+        plates.moving(
+            (0.24, 0.22), (0.2, 0.15, 0.9), np.array([-0.002, 0, -0.007]), np.array([0, 0.012, 0]), FRAMES, 2
+        ),
     ]
 
 
@@ -76,7 +80,7 @@ def test_a_hidden_point_is_carried_on_and_said_to_be_hidden() -> None:
     ]
     clip, owner = plates.film(scene)
     xy = queries(owner, 1, count=12)
-    tracks, labels = label_clip(clip, xy, Bodies(), ChunkSettings(), LiftSettings())
+    _, labels = label_clip(clip, xy, Bodies(), ChunkSettings(), LiftSettings())
     truth = plates.paths(scene, clip, owner, xy)
     uv, z = clip.camera.project(truth)
     j, i = np.rint(uv).astype(int).transpose(2, 0, 1)
@@ -215,7 +219,7 @@ def test_alignment_mends_a_wrong_pose_and_the_energy_says_so() -> None:
     plate = scene[1]
     R_true = plate.R[t] @ plate.R[0].T
     s_true = plate.t[t] - R_true @ plate.t[0]
-    off = Rotation.from_rotvec([0.01, -0.01, 0.02]).as_matrix() @ R_true, s_true + [0.004, -0.003, 0.003]
+    off = Rotation.from_rotvec([0.01, -0.01, 0.02]).as_matrix() @ R_true, s_true + np.array([0.004, -0.003, 0.003])
     R, s = _kernels.align(
         points, features[..., 1].astype(float), off[0][None], off[1][None], pictures.lightness(t), pictures.smooth[t],
         pictures.normal[t], pictures.K, 10,
@@ -225,6 +229,8 @@ def test_alignment_mends_a_wrong_pose_and_the_energy_says_so() -> None:
     assert after < 0.001
     assert after < 0.2 * before
     candidates = np.stack([R_true, off[0], np.eye(3)])[None], np.stack([s_true, off[1], np.zeros(3)])[None]
-    energy, seen = _kernels.energies(points, features, *candidates, pictures.depth[t], pictures.feature[t], pictures.K, 1)
+    energy, seen = _kernels.energies(
+        points, features, *candidates, pictures.depth[t], pictures.feature[t], pictures.K, 1
+    )
     assert energy[0].argmin() == 0
     assert seen[0, 0] > 0.95

@@ -8,16 +8,29 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Cli
 from matplotlib.image import imread
 from rerun.chunk import RrdReader
+from synthetic import (
+    LOOKING_ALONG_Y,
+    call_cli,
+    make_dataset,
+    make_episode,
+    make_filmed_episode,
+    make_manifest,
+    make_receipt,
+)
 
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
-from flowlab.viz.colours import ROLE_RGB, UNKNOWN
-from flowlab.viz.facts import describe
+from flowlab.storage.dataset import begin, keep_receipt
+from flowlab.storage.manifest import Reject
+from flowlab.storage.shard import write_shard
+from flowlab.viz.colours import ROLE_RGB, UNKNOWN, cloud_rgb_at, sigma_rgb
+from flowlab.viz.facts import caption, describe, moving
+from flowlab.viz.layout import layout
 from flowlab.viz.recording import TRAIL_STEPS, write_recording
 from flowlab.viz.still import TIME_COLOURS, compose, draw_still
+from flowlab.viz.upright import up_from_world
 
 T, P, M, DISTINCT_POINTS, DISTINCT_QUERIES = 30, 50, 8, 40, 6
 FAR = 99.0
@@ -68,6 +81,12 @@ def bare(episode: Episode) -> Episode:
     return replace(episode, depth=None, rgb=None, object_pose=None)
 
 
+@pytest.fixture
+def real() -> Episode:
+    """From a recording, in the frame of its camera."""
+    return make_filmed_episode()
+
+
 def columns(path: Path, blueprint: bool = False) -> dict[tuple[str, str], list[Any]]:
     """The rows of every column of a recording or its blueprint, by entity and component."""
     reader = RrdReader(path)
@@ -86,7 +105,7 @@ def recorded(episode: Episode, tmp_path: Path) -> dict[tuple[str, str], list[Any
     return columns(tmp_path / "e.rrd")
 
 
-@pytest.mark.parametrize("kind", ["episode", "bare"])
+@pytest.mark.parametrize("kind", ["episode", "bare", "real"])
 def test_rerun_can_read_every_recording(kind: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     write_recording(request.getfixturevalue(kind), tmp_path / "e.rrd", name="slide")
     rerun = Path(sys.executable).with_name("rerun")
@@ -269,12 +288,215 @@ def test_one_frame_is_enough(episode: Episode, tmp_path: Path) -> None:
     assert picture(one, tmp_path / "e.png").shape == (960, 1800, 3)
 
 
-@pytest.mark.parametrize("option", ["--png", "--save"])
+def test_estimated_tracks_are_coloured_by_their_error(real: Episode, tmp_path: Path) -> None:
+    assert real.tracks.quality is not None
+    packed = np.array(recorded(real, tmp_path)["/world/tracks/points", "Points3D:colors"], np.uint32)
+    rgb = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], -1)
+    expected = sigma_rgb(real.tracks.quality.sigma[:, :5])
+    np.testing.assert_array_equal(rgb[:, :2], expected[:, :2])  # in sight
+    assert (rgb[:, 2:] < 0.6 * expected[:, 2:]).all()
+    assert np.abs(expected[0, 0].astype(int) - expected[0, 1]).max() > 100
+
+
+def test_error_and_visibility_are_plotted_over_time(real: Episode, tmp_path: Path) -> None:
+    assert real.tracks.quality is not None
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(0, 0.05, real.tracks.visible.shape).astype(np.float32)
+    visible = rng.random(sigma.shape) < 0.5
+    tracks = replace(real.tracks, visible=visible, quality=replace(real.tracks.quality, sigma=sigma))
+    found = recorded(replace(real, tracks=tracks), tmp_path)
+    read = {
+        key: np.ravel(found[f"/scalars/quality/{key}", "Scalars:scalars"])
+        for key in ("sigma_median", "sigma_p90", "visible")
+    }
+    in_order = 1000 * np.sort(sigma[:, :5], 1)  # the sixth repeats one of them
+    np.testing.assert_allclose(read["sigma_median"], in_order[:, 2], rtol=1e-5)
+    np.testing.assert_allclose(read["sigma_p90"], 0.4 * in_order[:, 3] + 0.6 * in_order[:, 4], rtol=1e-5)
+    np.testing.assert_allclose(read["visible"], 100 * visible[:, :5].sum(1) / 5, rtol=1e-5)
+    kinds = [rows[0][0] for (_, name), rows in columns(tmp_path / "e.rrd", True).items() if "class_id" in name]
+    assert kinds.count("TimeSeries") == 3
+
+
+def test_info_says_who_tracked_and_how_well(real: Episode) -> None:
+    text = describe(real)
+    for row in (
+        "| recording | pour-3 |",
+        "| tracker | bodies |",
+        "| its licence | Apache-2.0 |",
+        "| positions | 40% measured, 40% model, 20% filled |",
+        "| stated error | σ median 20 mm, p90 60 mm |",
+    ):
+        assert row in text
+    assert "40 mm and more" in text
+    assert "σ median 20 mm" in caption(real, 1)
+    assert "tracker" not in describe(replace(real, tracks=replace(real.tracks, quality=None)))
+    nobody = describe(replace(real, extras={}))
+    assert "| tracker | not known |" in nobody
+
+
+def test_what_moves_must_move_beyond_its_stated_error(real: Episode) -> None:
+    assert real.tracks.quality is not None
+    assert moving(real).tolist() == [True, False, False, False, False]  # the second by 17 cm, if with 2 x 8.5 cm
+    sure = replace(real.tracks.quality, sigma=np.full_like(real.tracks.quality.sigma, 0.001))
+    assert moving(replace(real, tracks=replace(real.tracks, quality=sure)))[:2].all()
+
+
+def test_in_the_frame_of_the_camera_up_is_against_y(real: Episode, episode: Episode, tmp_path: Path) -> None:
+    for e, up in ((real, [0, -1, 0]), (episode, [0, 0, 1])):
+        np.testing.assert_array_equal(up_from_world(e.camera) @ up, [0, 0, 1])
+        recorded(e, tmp_path)
+        shown = columns(tmp_path / "e.rrd", blueprint=True)
+        (eye_up,) = [rows[0][0] for (_, name), rows in shown.items() if name == "EyeControls3D:eye_up"]
+        np.testing.assert_array_equal(eye_up, up)
+        (plane,) = [rows[0][0] for (_, name), rows in shown.items() if name == "LineGrid3D:plane"]
+        normal, distance = np.array(plane[:3]), plane[3]
+        np.testing.assert_array_equal(normal, up)
+        points = e.tracks.xyz_world[:, : e.queries.count].reshape(-1, 3) @ normal
+        assert distance <= np.percentile(points, 2)  # the floor lies below
+        (eye,) = [rows[0][0] for (_, name), rows in shown.items() if name == "EyeControls3D:position"]
+        assert eye @ normal > points.max()  # and is looked at from above
+
+
+def test_recordings_say_which_axis_is_up(real: Episode, episode: Episode, tmp_path: Path) -> None:
+    up, down = 1, 2  # Rerun's numbers
+    for e, axis, way in ((real, 1, down), (episode, 2, up)):
+        (axes,) = recorded(e, tmp_path)["/", "ViewCoordinates:xyz"]
+        assert axes[0][axis] == way
+
+
+def test_a_layout_has_no_plot_of_nothing(real: Episode, tmp_path: Path) -> None:
+    idle = replace(real, state=np.zeros((12, 0), np.float32), action=np.zeros((12, 0), np.float32))
+    found = recorded(idle, tmp_path)
+    assert not any(entity.startswith(("/scalars/state", "/scalars/action")) for entity, _ in found)
+    kinds = [rows[0][0] for (_, name), rows in columns(tmp_path / "e.rrd", True).items() if "class_id" in name]
+    assert kinds.count("TimeSeries") == 2
+
+
+def test_a_lost_point_does_not_shrink_the_scene() -> None:
+    long = make_filmed_episode(steps=300)
+    xyz_world = long.tracks.xyz_world.copy()
+    xyz_world[200:202, 2] = 500
+    lost = replace(long, tracks=replace(long.tracks, xyz_world=xyz_world))
+    for e in (long, lost):
+        spans = [np.ptp(compose(e, "").axes[k].get_xlim()) for k in (0, 1)]
+        assert spans[0] < 2000
+        assert spans[1] < 10
+        eye = layout(e).root_container.contents[0].properties["EyeControls3D"]  # type: ignore[union-attr]
+        assert np.abs(eye.position.as_arrow_array().to_pylist()).max() < 10
+
+
+def test_clouds_of_recordings_have_the_colours_of_the_picture(real: Episode, episode: Episode) -> None:
+    assert real.rgb is not None
+    real.rgb[3, 2, 10] = (200, 10, 30)
+    rgb = cloud_rgb_at(real, 3)
+    expected = np.full((len(rgb), 3), 128)
+    expected[1] = (200, 10, 30)  # the second point of the wall was seen at u = 10, v = 2
+    np.testing.assert_array_equal(rgb, expected)
+    behind = real.point_cloud.copy()
+    behind[3, :2] = [[0, 0, -1], [50, 0, 1]]
+    assert len(np.unique(cloud_rgb_at(replace(real, point_cloud=behind), 3), axis=0)) == 2  # grey for these
+    assert not (cloud_rgb_at(episode, 0) == 128).all()
+
+
+def test_stills_of_recordings_are_upright(real: Episode) -> None:
+    figure = compose(real, "pour")
+    camera, side = figure.axes[:2]
+    assert (side.get_xlabel(), side.get_ylabel()) == ("z [m]", "−y [m]")
+    points = np.concatenate(
+        [c.get_offsets() for c in side.collections if len(c.get_offsets()) == len(real.point_cloud[0])]
+    )
+    np.testing.assert_allclose(np.sort(points[:, 1]), np.sort(-real.point_cloud[0, :, 1]), atol=1e-6)
+    assert side.get_ylim()[1] > side.get_ylim()[0]
+    assert camera.get_ylim()[1] < camera.get_ylim()[0]
+    placed = make_filmed_episode(LOOKING_ALONG_Y)
+    assert compose(placed, "pour").axes[1].get_ylabel() == "z [m]"
+
+
+def test_stills_of_recordings_show_the_error(real: Episode, tmp_path: Path) -> None:
+    image = picture(real, tmp_path / "e.png")
+    for k in (2, 3):  # those that stand still have dots only
+        expected = 0.8 * sigma_rgb(np.array([0.02]))[0]
+        uv, _ = real.camera.project(real.tracks.xyz_world[0, k])
+        assert np.abs(colours_at(image, real, 0, uv) - expected).max(-1).min() < 12
+    texts = [text.get_text() for text in compose(real, "pour").legends[0].get_texts()]
+    assert texts == ["σ = 0 mm", "σ = 20 mm", "≥ 40 mm", "start", "end"]
+
+
+def test_a_note_stands_in_the_still(real: Episode) -> None:
+    texts = [text.get_text() for text in compose(real, "pour", note="too poor " * 60).texts]
+    (note,) = [text for text in texts if text.startswith("too poor")]
+    assert note.endswith("…")
+    assert len(note) <= 170
+
+
+@pytest.fixture
+def pours(tmp_path: Path) -> Path:
+    """One good episode and two rejects, of which one left nothing to look at."""
+    folder = tmp_path / "data"
+    manifest = begin(folder, make_manifest({"pour": 3}))
+    rejects = (
+        Reject(task="pour", seed=4, stage="recording", reason="no frame is whole"),
+        Reject(task="pour", seed=5, stage="quality", reason="too unsure", position=0),
+    )
+    receipt = make_receipt([make_filmed_episode()], seeds=(3, 4, 5), rejects=rejects)
+    write_shard(folder / receipt.shard, [make_filmed_episode()], manifest.settings_digest)
+    write_shard(folder / receipt.rejects_shard, [make_filmed_episode(seed=5)], manifest.settings_digest)
+    keep_receipt(folder, receipt)
+    return folder
+
+
+def test_films_from_the_command_line(pours: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    code, out, _ = call_cli(capsys, "viz", pours, "--mp4", tmp_path / "e.mp4")
+    assert (code, out) == (0, f"pour seed 3: {tmp_path / 'e.mp4'}\n")
+    assert (tmp_path / "e.mp4").read_bytes()[4:8] == b"ftyp"
+    assert {p.name for p in tmp_path.iterdir()} == {"data", "e.mp4"}  # no recording unless asked for
+    code, _, errors = call_cli(capsys, "viz", pours, "--fps", "5")
+    assert code == 2
+    assert "--mp4" in errors
+
+
+def test_rejects_can_be_looked_at(pours: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    code, out, _ = call_cli(
+        capsys, "viz", pours, "--rejects", "--episode", "1", "--task", "pour", "--png", tmp_path / "e.png",
+        "--mp4", tmp_path / "e.mp4", "--save", tmp_path / "e.rrd",
+    )  # fmt: skip
+    assert code == 0
+    assert out.splitlines()[0] == "pour seed 5 was rejected at quality: too unsure"
+    assert (tmp_path / "e.png").exists()
+    found = columns(tmp_path / "e.rrd")
+    assert "rejected at quality: too unsure" in found["/info", "TextDocument:text"][0][0]
+    assert found["/__properties", "RecordingInfo:name"] == [["pour seed 5 (rejected)"]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--rejects"], "pour seed 4 was rejected at recording (no frame is whole)"),
+        (["--rejects", "--episode", "2"], "no reject 2; there are 2, counted from 0"),
+        (["--rejects", "--task", "push"], "task 'push': no reject 0; there are 0"),
+        (["--episode", "1"], "no episode 1; there are 1, counted from 0"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_sentence(
+    arguments: list[str], message: str, pours: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, errors = call_cli(capsys, "viz", pours, *arguments)
+    assert (code, out) == (3, "")
+    assert message in " ".join(errors.split())
+
+
+def test_a_dataset_without_pictures_has_no_film(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    make_dataset(tmp_path / "data", [[make_episode()]])
+    code, _, errors = call_cli(capsys, "viz", tmp_path / "data", "--mp4", tmp_path / "e.mp4")
+    assert code == 3
+    assert "write.depth=true" in errors
+
+
+@pytest.mark.parametrize("option", ["--png", "--save", "--mp4"])
 def test_a_place_that_cannot_be_written_is_one_sentence(
-    option: str, flowlab: Cli, small_dataset: Path, tmp_path: Path
+    option: str, pours: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     (tmp_path / "file").touch()
-    result = flowlab("viz", small_dataset, option, tmp_path / "file" / "picture")
-    assert result.returncode == 1
-    assert "file/picture: cannot be written" in result.stderr
-    assert "Traceback" not in result.stderr
+    code, _, errors = call_cli(capsys, "viz", pours, option, tmp_path / "file" / "picture")
+    assert code == 1
+    assert "file/picture: cannot be written" in "".join(errors.splitlines())

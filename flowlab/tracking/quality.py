@@ -46,7 +46,9 @@ def evidence(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float64[np.ndarray
         _log_mm(moved),
         _log_mm(_known(tracks.disagreement, z) * metres_per_px),
         _log_mm(_known(tracks.forward_backward, z) * metres_per_px),
-        1 - tracks.confidence if tracks.residual is None else np.where(tracks.residual < 0, 1 - tracks.confidence, tracks.residual),
+        1 - tracks.confidence
+        if tracks.residual is None
+        else np.where(tracks.residual < 0, 1 - tracks.confidence, tracks.residual),
         ~lifted.visible,
         ~lifted.depth_valid,
         np.log1p(_frames_hidden(lifted.visible)),

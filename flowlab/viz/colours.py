@@ -1,7 +1,7 @@
-"""The colours that recordings and stills share: one per role, loud for tracks and quiet for clouds."""
+"""The colours that recordings, stills and films share: tracks loud, by role or by stated error; clouds quiet."""
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 from flowlab.records import Episode, Role
@@ -17,6 +17,10 @@ ROLE_RGB = {
     UNKNOWN: (163, 130, 200),
 }
 """sRGB of each role; told apart by people who confuse red with green, too."""
+SIGMA_LIMIT = 0.04
+"""Stated errors from here on [m] have the colour of the worst. The scale is the same in every picture."""
+SIGMA_RGB = ((40, 226, 204), (250, 214, 70), (240, 44, 82))
+"""sRGB of stated errors of 0, half the limit, and the limit; others lie between. Told apart as above."""
 SERIES_RGB = [
     (94, 160, 230), (245, 156, 80), (108, 196, 150), (230, 112, 162), (178, 150, 218), (222, 200, 90),
     (110, 205, 215), (226, 112, 98), (170, 178, 188),
@@ -33,10 +37,39 @@ def role_rgb(role: Int[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:
     return colours
 
 
+def sigma_rgb(sigma: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:
+    """The colour of each stated error [m]."""
+    level = np.nan_to_num(sigma / SIGMA_LIMIT, nan=1.0)
+    channels = [np.interp(level, [0, 0.5, 1], anchors) for anchors in zip(*SIGMA_RGB, strict=True)]
+    return np.stack(channels, -1).round().astype(np.uint8)
+
+
+def track_rgb(episode: Episode) -> UInt8[np.ndarray, "T M 3"]:
+    """The colour of every distinct query point at every step: by stated error where there is one, else by role."""
+    M, quality = episode.queries.count, episode.tracks.quality
+    if quality is not None:
+        return sigma_rgb(quality.sigma[:, :M])
+    return np.broadcast_to(role_rgb(episode.query_role[:M]), (len(episode), M, 3))
+
+
 def cloud_rgb(role: Int[np.ndarray, "*batch"], tint: float = 0.35) -> UInt8[np.ndarray, "*batch 3"]:
     """Grey with a share ``tint`` of the role's colour; plain grey where the role is not known."""
     known = (role != UNKNOWN)[..., None]
     return np.where(known, (1 - tint) * _CLOUD_GREY + tint * role_rgb(role), _CLOUD_GREY).astype(np.uint8)
+
+
+def cloud_rgb_at(episode: Episode, t: int) -> UInt8[np.ndarray, "P 3"]:
+    """The colour of every distinct cloud point of step t: by role, or from the colour picture where nobody
+    knows what any point lies on."""
+    points = episode.point_cloud[t, : episode.point_count[t]]
+    if episode.rgb is None or (episode.query_role != UNKNOWN).any():
+        return cloud_rgb(cloud_role(episode, t))
+    uv, z = episode.camera.project(points)
+    u, v = np.round(np.where(z[:, None] > 0, uv, -1)).clip(-1, np.shape(episode.rgb)[2:0:-1]).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < episode.rgb.shape[2]) & (v < episode.rgb.shape[1])
+    rgb = np.tile(_CLOUD_GREY.astype(np.uint8), (len(points), 1))
+    rgb[inside] = episode.rgb[t, v[inside], u[inside]]
+    return rgb
 
 
 def cloud_role(episode: Episode, t: int) -> Int[np.ndarray, "P"]:

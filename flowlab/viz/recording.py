@@ -12,9 +12,10 @@ from jaxtyping import Bool, UInt8
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode
 from flowlab.storage.files import temporary_path
-from flowlab.viz.colours import SERIES_RGB, SUCCESS_RGB, cloud_rgb, cloud_role, role_rgb
+from flowlab.viz.colours import SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
 from flowlab.viz.facts import describe
 from flowlab.viz.layout import CAMERA, DEPTH, RGB, layout, size
+from flowlab.viz.upright import in_camera_frame
 
 TRAIL_STEPS = 20
 """A trail shows where a point was over this many steps."""
@@ -64,14 +65,13 @@ def _times(episode: Episode) -> list[rr.TimeColumn]:
 
 
 def _send_info(recording: rr.RecordingStream, text: str) -> None:
-    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("/info", rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
     steps = range(len(episode))
     points = [episode.point_cloud[t, : episode.point_count[t]] for t in steps]
-    colours = [cloud_rgb(cloud_role(episode, t)) for t in steps]
+    colours = [cloud_rgb_at(episode, t) for t in steps]
     columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colours))
     recording.send_columns("/world/cloud", _times(episode), columns.partition([len(p) for p in points]))
     recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * size(episode)), static=True)
@@ -80,7 +80,7 @@ def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
 def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
     T, M = len(episode), episode.queries.count
     xyz_world = episode.tracks.xyz_world[:, :M]
-    rgb = _shaded(role_rgb(episode.query_role[:M]), episode.tracks.visible[:, :M])
+    rgb = _shaded(track_rgb(episode), episode.tracks.visible[:, :M])
     columns = rr.Points3D.columns(positions=xyz_world.reshape(-1, 3), colors=rgb.reshape(-1, 3))
     recording.send_columns("/world/tracks/points", _times(episode), columns.partition([M] * T))
     recording.log("/world/tracks/points", rr.Points3D.from_fields(radii=0.005 * size(episode)), static=True)
@@ -93,13 +93,15 @@ def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
     recording.log("/world/tracks/trails", rr.LineStrips3D.from_fields(radii=0.0012 * size(episode)), static=True)
 
 
-def _shaded(rgb: UInt8[np.ndarray, "M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
+def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
     """The colours at every step, darker where the camera does not see the point."""
     return (rgb * np.where(visible, 1.0, _HIDDEN_LIGHT)[..., None]).astype(np.uint8)
 
 
 def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
     camera, T_world_cam = episode.camera, episode.camera.T_world_cam
+    axes = rr.ViewCoordinates.RDF if in_camera_frame(camera) else rr.ViewCoordinates.RIGHT_HAND_Z_UP
+    recording.log("/", axes, static=True)
     recording.log(CAMERA, rr.Transform3D(translation=T_world_cam[:3, 3], mat3x3=T_world_cam[:3, :3]), static=True)
     pinhole = rr.Pinhole(
         image_from_camera=camera.K,
@@ -137,12 +139,26 @@ def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
-    series = {f"state/{k}": column for k, column in enumerate(episode.state.T)}
-    series |= {f"action/{k}": column for k, column in enumerate(episode.action.T)}
-    series |= {"success": episode.success.astype(float)}
-    for key, values in series.items():
-        group, _, k = key.partition("/")
-        colour = SERIES_RGB[int(k) % len(SERIES_RGB)] if k else SUCCESS_RGB
-        style = rr.SeriesLines(names=f"{group} {k}".strip(), colors=colour, widths=1.5)
-        recording.log(f"/scalars/{key}", style, static=True)
-        recording.send_columns(f"/scalars/{key}", _times(episode), rr.Scalars.columns(scalars=values))
+    for group, table in (("state", episode.state), ("action", episode.action)):
+        for k, column in enumerate(table.T):
+            colour = SERIES_RGB[k % len(SERIES_RGB)]
+            _send_line(recording, episode, f"{group}/{k}", column, name=f"{group} {k}", colour=colour)
+    _send_line(recording, episode, "success", episode.success.astype(float), name="success", colour=SUCCESS_RGB)
+    if episode.tracks.quality is not None:
+        M = episode.queries.count
+        median, p90 = np.percentile(1000 * episode.tracks.quality.sigma[:, :M], [50, 90], axis=1)
+        seen = 100 * episode.tracks.visible[:, :M].mean(1)
+        for key, values, name, colour in [
+            ("sigma_median", median, "σ median [mm]", SIGMA_RGB[0]),
+            ("sigma_p90", p90, "σ 90th percentile [mm]", SIGMA_RGB[2]),
+            ("visible", seen, "in sight [%]", SUCCESS_RGB),
+        ]:
+            _send_line(recording, episode, f"quality/{key}", values, name=name, colour=colour)
+
+
+def _send_line(
+    recording: rr.RecordingStream, episode: Episode, key: str, values: np.ndarray, *, name: str, colour: tuple[int, ...]
+) -> None:
+    """One line of a plot: a value per step."""
+    recording.log(f"/scalars/{key}", rr.SeriesLines(names=name, colors=colour, widths=1.5), static=True)
+    recording.send_columns(f"/scalars/{key}", _times(episode), rr.Scalars.columns(scalars=values))

@@ -1,4 +1,7 @@
-"""The inner loops of the rigid-body fit, compiled. Positions are metres in the camera frame, pixels have integer centres."""
+"""The inner loops of the rigid-body fit, compiled.
+
+Positions are metres in the camera frame; pixels have integer centres.
+"""
 
 # mypy: ignore-errors
 import numba
@@ -126,7 +129,7 @@ def align(points, lightness, R, t, lightness_picture, smooth, normal, K, iterati
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     bodies, n = lightness.shape
     R, t = R.copy(), t.copy()
-    X, J = np.empty((n, 3)), np.empty((n, 6))
+    X = np.empty((n, 3))
     grey, gx, gy = np.empty(n), np.empty(n), np.empty(n)
     for b in range(bodies):
         for _ in range(iterations):
@@ -389,12 +392,40 @@ def inlier_share(R, t, start, path, known, within):
 
 @numba.njit(cache=True)
 def shown(depth, uv, z):
-    """Whether depth pictures (T, H, W) have a reading like z (T, M) [m] at pixels (T, M, 2), or none at all."""
+    """Whether depth pictures (T, H, W) have a reading like z (T, M) [m] around pixels (T, M, 2), or none at all."""
+    height, width = depth.shape[1:]
     out = np.zeros(z.shape, np.bool_)
     for t in range(z.shape[0]):
         for k in range(z.shape[1]):
-            off, _, farthest = layers(depth[t], uv[t, k, 0], uv[t, k, 1], z[t, k])
-            out[t, k] = farthest == 0 or off < 0.015
+            i, j = int(np.rint(uv[t, k, 1])), int(np.rint(uv[t, k, 0]))
+            empty = True
+            for y in range(max(i - 1, 0), min(i + 2, height)):
+                for x in range(max(j - 1, 0), min(j + 2, width)):
+                    if depth[t, y, x] > 0:
+                        empty = False
+                        out[t, k] |= abs(depth[t, y, x] - z[t, k]) < 2 * tolerance(z[t, k])
+            out[t, k] |= empty
+    return out
+
+
+@numba.njit(cache=True)
+def above_surface(depth, uv, z):
+    """How far beyond points at pixels (T, M, 2) and depths (T, M) [m] the surface is read: the mean of the readings
+    around that are nearly as deep, not a number where there is none."""
+    height, width = depth.shape[1:]
+    out = np.full(z.shape, np.nan)
+    for t in range(z.shape[0]):
+        for k in range(z.shape[1]):
+            i, j = int(np.rint(uv[t, k, 1])), int(np.rint(uv[t, k, 0]))
+            total, n = 0.0, 0
+            for y in range(max(i - 1, 0), min(i + 2, height)):
+                for x in range(max(j - 1, 0), min(j + 2, width)):
+                    off = depth[t, y, x] - z[t, k]
+                    if depth[t, y, x] > 0 and abs(off) < 0.6 * tolerance(z[t, k]):
+                        total += off
+                        n += 1
+            if n:
+                out[t, k] = total / n
     return out
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
+from scipy.ndimage import convolve
 
 from flowlab.tracking.bodies import _kernels
 from flowlab.tracking.bodies.fit import Fit
@@ -13,6 +14,8 @@ from flowlab.tracking.bodies.segments import STEP
 _OWN = 0.7
 """Weight of a point's own cost against one cell's that looks exactly like it."""
 
+_SETTLING, _SETTLING_PRIOR = 4, 3.0
+"""Frames to either side over which readings of the surface are averaged, and the weight of no shift among them."""
 _ALMOST = 0.06
 """A cost this much higher explains a point almost as well."""
 
@@ -40,11 +43,29 @@ def carry(fit: Fit, uv: np.ndarray, z: np.ndarray) -> Carried:
     motion = cost.argmin(0)
     every = np.stack([m.carry(xyz) for m in fit.motions])
     path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
+    path = _settled(fit, path, motion > 0)
     seen, least = _seen(fit, path), cost.min(0)
     belief = np.exp(-(cost - least) / _ALMOST)
     belief /= belief.sum(0)
     spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
     return Carried(path, seen, motion, least, spread, _residual(fit, uv, path, seen, least))
+
+
+def _settled(fit: Fit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Paths (T, M, 3) of moving points shifted along their rays to the surface that is read there, smoothly in time.
+
+    What is left of a pose's error changes slowly, while the sensor's changes from frame to frame; a still point is
+    left alone, since it has no pose to err.
+    """
+    z = path[..., 2]
+    off = _kernels.above_surface(fit.pictures.depth, fit.pictures.project(path), z)
+    off[:, ~moving], off[0] = np.nan, 0
+    known = np.isfinite(off).astype(float)
+    window = np.hanning(2 * _SETTLING + 3)[1:-1, None]
+    total, weight = (convolve(x, window, mode="constant") for x in (np.nan_to_num(off), known))
+    smooth = total / (weight + _SETTLING_PRIOR)
+    smooth[0] = 0
+    return path * (1 + smooth / np.maximum(z, 0.05))[..., None]
 
 
 def _residual(fit: Fit, uv: np.ndarray, path: np.ndarray, seen: np.ndarray, cost: np.ndarray) -> np.ndarray:

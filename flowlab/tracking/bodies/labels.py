@@ -45,9 +45,7 @@ def point_costs(
     frames = np.unique(np.linspace(1, len(pictures) - 1, min(len(pictures) - 1, _FRAMES)).round().astype(int))
     features = _kernels.features_at(pictures.feature[0], uv.astype(np.float32))
     R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
-    cost, moved = _kernels.label_costs(
-        xyz_cam, features, frames, R, t, pictures.depth, pictures.feature, pictures.K
-    )
+    cost, moved = _kernels.label_costs(xyz_cam, features, frames, R, t, pictures.depth, pictures.feature, pictures.K)
     return cost + price * moved
 
 
@@ -66,7 +64,7 @@ def label(pictures: Pictures, grid: Grid, bodies: Sequence[Body]) -> Labels:
     return Labels(raw, cost)
 
 
-def needed(labels: Labels, margin: float = 0.05) -> list[int]:
+def needed(labels: Labels, margin: float = 0.15) -> list[int]:
     """The motions worth having: dropped, one by one, is what costs its cells little to do without."""
     kept = list(range(len(labels.cost)))
     while len(kept) > 2:

@@ -1,6 +1,7 @@
 """A clip in the form that the rigid-body fit works on."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -84,7 +85,7 @@ def prepare(clip: Clip, max_depth: float) -> Pictures:
         normal[k] = _kernels.surface_normals(smooth[k], K)
         feature[k] = _feature(clip.rgb[k], factor, offset)
     flow = np.zeros((*depth.shape, 2), np.float32)
-    dense = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dense: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     for k in range(1, len(depth)):
         flow[k] = dense.calc(feature[k - 1, :, :, 1].copy(), feature[k, :, :, 1].copy(), None)
     return Pictures(K, factor, offset, depth, smooth, normal, feature, flow)

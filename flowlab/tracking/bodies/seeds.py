@@ -1,6 +1,7 @@
 """Motions proposed by points that were followed: greedy RANSAC over whole paths."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ _MOST_SEEDS = 1000
 _FRAMES, _HYPOTHESES, _NEIGHBOURS = 24, 60, 14
 _INLIER = 0.75
 """Share of its known frames in which a point must follow a motion to belong to it."""
+_flow: Any = cv2.calcOpticalFlowPyrLK  # by its stub the guess could not be None
 _LK = {"winSize": (15, 15), "maxLevel": 3, "criteria": (3, 20, 0.01), "minEigThreshold": 1e-5}
 
 
@@ -43,8 +45,8 @@ def flow(pictures: Pictures, t: int, uv: np.ndarray) -> tuple[np.ndarray, np.nda
     """Where pixels (n, 2) of frame t - 1 are in frame t, and which of them come back when followed back."""
     before, after = (pictures.feature[k, :, :, 1].copy() for k in (t - 1, t))
     p = np.ascontiguousarray(uv, np.float32)
-    q, found, _ = cv2.calcOpticalFlowPyrLK(before, after, p, None, **_LK)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, q, None, **_LK)
+    q, found, _ = _flow(before, after, p, None, **_LK)
+    back, found_back, _ = _flow(after, before, q, None, **_LK)
     height, width = pictures.depth.shape[1:]
     inside = (q >= 0).all(1) & (q[:, 0] <= width - 1) & (q[:, 1] <= height - 1)
     return q, inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm(back - p, axis=1) < 1)
@@ -101,7 +103,8 @@ def propose(pictures: Pictures, paths: Paths, most: int, rng: np.random.Generato
     within = 0.010 * np.maximum(1, path[..., 2] ** 2)
     length = known.sum(0)
     reach = np.where(known, np.linalg.norm(path - start, axis=-1), 0).max(0)
-    free, proposals, misses = length >= 3, [], 0
+    free, misses = length >= 3, 0
+    proposals: list[Proposal] = []
 
     def share(R: np.ndarray, t: np.ndarray, of: np.ndarray) -> np.ndarray:
         return _kernels.inlier_share(R, t, start[of], path[:, of], known[:, of], within[:, of])

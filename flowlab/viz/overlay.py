@@ -1,0 +1,103 @@
+"""Query points and their trails, drawn over one enlarged picture of an episode."""
+
+import numpy as np
+from jaxtyping import UInt8
+
+from flowlab.records import Episode, Source
+from flowlab.viz.colours import track_rgb
+from flowlab.viz.upright import upright_pixels
+
+_RIM = (16, 18, 22)
+"""Around every mark, so that it shows on any picture."""
+_HIDDEN_LIGHT = 0.75
+_TRAIL_ALPHA = (0.9, 0.7, 0.45, 0.22)
+"""How opaque a trail is, from its newest quarter to its oldest."""
+_SUBPIXEL = 4
+"""Bits of OpenCV's fixed-point coordinates."""
+
+
+class Overlay:
+    """What is drawn over the pictures of an episode: a disc where a point is in sight, a ring where it is not,
+    a cross where its position was filled in; behind each, its trail.
+
+    ``scale`` is how many canvas pixels a pixel of the picture has, ``trail`` (at least 1) how many steps a trail
+    goes back.
+    """
+
+    def __init__(self, episode: Episode, scale: int, trail: int) -> None:
+        M, quality = episode.queries.count, episode.tracks.quality
+        uv = upright_pixels(episode.camera, episode.tracks.xyz_world[:, :M])
+        canvas_uv = (uv + 0.5) * scale - 0.5  # the centre of a pixel, enlarged
+        far = 8 * max(episode.camera.width, episode.camera.height) * scale  # OpenCV counts in 32 bits
+        self._there = np.all(np.abs(canvas_uv) < far, axis=-1)
+        self._uv = np.round(np.where(self._there[..., None], canvas_uv, 0) * 2**_SUBPIXEL).astype(np.int32)
+        self._visible = episode.tracks.visible[:, :M]
+        self._filled = np.zeros_like(self._visible) if quality is None else quality.source[:, :M] == Source.FILLED
+        self._rgb = track_rgb(episode)
+        self._trail = trail
+        self._size = max(1.0, episode.camera.width * scale / 640)
+
+    def draw(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
+        """Draw trails and points of step t onto the canvas."""
+        self._draw_trails(canvas, t)
+        there, visible, filled = self._there[t], self._visible[t], self._filled[t]
+        for k in np.flatnonzero(there & filled):
+            self._draw_cross(canvas, t, int(k))
+        for k in np.flatnonzero(there & ~filled & ~visible):
+            self._draw_ring(canvas, t, int(k))
+        for k in np.flatnonzero(there & ~filled & visible):
+            self._draw_disc(canvas, t, int(k))
+
+    def _draw_trails(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
+        """The last steps of every point as pieces from step to step, the older the fainter; faint where the
+        point was out of sight."""
+        import cv2
+
+        first = max(0, t - self._trail)
+        pieces = np.stack([self._uv[first:t], self._uv[first + 1 : t + 1]], 2)
+        there = self._there[first:t] & self._there[first + 1 : t + 1]
+        red, green, blue = np.moveaxis(self._rgb[first + 1 : t + 1].astype(int), -1, 0)
+        colour = np.where(there, red << 16 | green << 8 | blue, -1)
+        quarter = len(_TRAIL_ALPHA) * np.arange(t - first - 1, -1, -1) // self._trail
+        quarter = np.where(self._visible[first + 1 : t + 1], quarter[:, None], len(_TRAIL_ALPHA) - 1)
+        for age, alpha in reversed(list(enumerate(_TRAIL_ALPHA))):
+            layer = canvas.copy()
+            mine, of_colour = pieces[quarter == age], colour[quarter == age]
+            for c in np.unique(of_colour[of_colour >= 0]).tolist():
+                lines, rgb = list(mine[of_colour == c]), (c >> 16, c >> 8 & 255, c & 255)
+                cv2.polylines(layer, lines, False, rgb, self._px(1.6), cv2.LINE_AA, _SUBPIXEL)
+            cv2.addWeighted(layer, alpha, canvas, 1 - alpha, 0, dst=canvas)
+
+    def _draw_disc(self, canvas: UInt8[np.ndarray, "H W 3"], t: int, k: int) -> None:
+        import cv2
+
+        for radius, rgb in ((4.9, _RIM), (3.8, self._ink(t, k))):
+            cv2.circle(canvas, self._at(t, k), self._sub(radius), rgb, -1, cv2.LINE_AA, _SUBPIXEL)
+
+    def _draw_ring(self, canvas: UInt8[np.ndarray, "H W 3"], t: int, k: int) -> None:
+        import cv2
+
+        for radius, rgb in ((6.0, _RIM), (5.2, self._ink(t, k, _HIDDEN_LIGHT))):
+            cv2.circle(canvas, self._at(t, k), self._sub(radius), rgb, self._px(1.6), cv2.LINE_AA, _SUBPIXEL)
+
+    def _draw_cross(self, canvas: UInt8[np.ndarray, "H W 3"], t: int, k: int) -> None:
+        import cv2
+
+        (u, v), arm = self._at(t, k), self._sub(3.2)
+        strokes = [np.array([[u - arm, v - s * arm], [u + arm, v + s * arm]]) for s in (1, -1)]
+        for width, rgb in ((3.4, _RIM), (1.6, self._ink(t, k, _HIDDEN_LIGHT))):
+            cv2.polylines(canvas, strokes, False, rgb, self._px(width), cv2.LINE_AA, _SUBPIXEL)
+
+    def _at(self, t: int, k: int) -> tuple[int, int]:
+        return int(self._uv[t, k, 0]), int(self._uv[t, k, 1])
+
+    def _ink(self, t: int, k: int, light: float = 1.0) -> tuple[int, ...]:
+        return tuple(int(light * channel) for channel in self._rgb[t, k])
+
+    def _px(self, length: float) -> int:
+        """A line width, for this size of canvas [px]."""
+        return max(1, round(length * self._size))
+
+    def _sub(self, length: float) -> int:
+        """A length, for this size of canvas, in OpenCV's fixed point."""
+        return round(length * self._size * 2**_SUBPIXEL)

@@ -1,0 +1,116 @@
+"""An episode as a film: its pictures, and where its tracks put the query points in them."""
+
+import os
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from flowlab.errors import DataError
+from flowlab.records import Episode
+from flowlab.storage.files import temporary_path
+from flowlab.viz.overlay import Overlay
+from flowlab.viz.strip import Strip
+from flowlab.viz.upright import hangs
+
+WIDTH = 640
+"""Smaller pictures are enlarged, by a whole factor, to at least this width [px]: trails need room."""
+_ONE_FRAME_FPS = 10.0
+_BT709 = 1
+
+
+def write_video(
+    episode: Episode, path: Path, *, fps: float | None = None, trail_s: float = 0.5, title: str = "", note: str = ""
+) -> None:
+    """Write an H.264 ``.mp4`` that browsers play, a frame per step. ``path`` is either absent, as before, or whole.
+
+    Every query point is drawn where its track is in the colour picture, or in the depth picture where there is
+    no colour; by default in real time, with trails over the last half second. ``title`` is said instead of task
+    and seed; ``note`` stands below, in red. Raises :class:`DataError` where the episode has no pictures.
+    """
+    pictures = Pictures(episode)
+    rate = Fraction(mean_fps(episode) if fps is None else fps).limit_denominator(1000)
+    overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))))
+    strip = Strip(episode, pictures.scale * episode.camera.width, title or f"{episode.task}, seed {episode.seed}", note)
+    temporary = temporary_path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        _encode(temporary, rate, (_frame(pictures, overlay, strip, t) for t in range(len(episode))))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def mean_fps(episode: Episode) -> float:
+    """Steps per second."""
+    seconds = float(episode.time_s[-1] - episode.time_s[0])
+    return (len(episode) - 1) / seconds if seconds > 0 else _ONE_FRAME_FPS
+
+
+class Pictures:
+    """The pictures of an episode, upright and enlarged by a whole factor: colour, or else grey depth."""
+
+    def __init__(self, episode: Episode) -> None:
+        if episode.rgb is None and episode.depth is None:
+            simulated = episode.tracks.quality is None
+            how = "--renderer gl --set expert.scene.rgb=true" if simulated else "--set write.rgb=true"
+            raise DataError(
+                f"{episode.task}, seed {episode.seed}: the dataset holds neither colour nor depth pictures to draw on; "
+                f"make it anew, into a new folder, with {how} (colour) or --set write.depth=true"
+            )
+        self._episode = episode
+        self.scale = -(-WIDTH // episode.camera.width)
+        """Pixels of the film for one of the picture, each way."""
+        self._near_far = _depth_range(episode)
+
+    def draw(self, t: int) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture of step t, at ``scale`` times its size."""
+        import cv2
+
+        camera, rgb = self._episode.camera, self._episode.rgb
+        picture = self._grey_depth(t) if rgb is None else rgb[t]
+        if hangs(camera):
+            picture = picture[::-1, ::-1]
+        size = camera.width * self.scale, camera.height * self.scale
+        return np.asarray(cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+    def _grey_depth(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
+        """What is near is bright; what has no depth, black."""
+        assert self._episode.depth is not None
+        depth, (near, far) = self._episode.depth[t], self._near_far
+        grey = np.interp(depth, [near, far], [225, 50]) * (depth > 0)
+        return np.repeat(grey.astype(np.uint8)[..., None], 3, -1)
+
+
+def _depth_range(episode: Episode) -> tuple[float, float]:
+    """Between which depths [m] nearly all readings of the episode lie."""
+    known = np.zeros(0) if episode.depth is None else episode.depth[episode.depth > 0]
+    near, far = np.percentile(known[:: max(1, len(known) // 100_000)], [1, 99]) if len(known) else (0.0, 1.0)
+    return float(near), float(max(far, near + 1e-3))
+
+
+def _frame(pictures: Pictures, overlay: Overlay, strip: Strip, t: int) -> UInt8[np.ndarray, "h w 3"]:
+    """One frame of the film, of even height and width, as yuv420p needs."""
+    picture = pictures.draw(t)
+    overlay.draw(picture, t)
+    frame = np.concatenate([picture, strip.draw(t)])
+    return np.pad(frame, [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)], mode="edge")
+
+
+def _encode(path: Path, rate: Fraction, frames: Iterator[UInt8[np.ndarray, "h w 3"]]) -> None:
+    import av
+
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as film:
+        stream = film.add_stream("h264", rate=rate, options={"crf": "18"})
+        stream.pix_fmt = "yuv420p"
+        stream.colorspace = stream.color_primaries = stream.color_trc = _BT709
+        for t, rgb in enumerate(frames):
+            if t == 0:
+                stream.height, stream.width = rgb.shape[:2]
+            frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709")
+            frame.pts, frame.time_base = t, 1 / rate
+            film.mux(stream.encode(frame))
+        film.mux(stream.encode())
