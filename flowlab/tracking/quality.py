@@ -10,9 +10,9 @@ EVIDENCE = ("1", "depth", "moved", "disagreement", "forward-backward", "doubt", 
 """What the error is told from, see :func:`evidence`."""
 
 WEIGHTS = {
-    Source.MEASURED: (-5.0, 0.5, 0.3, 0.2, 0.2, 0.5, 0.0, 0.0, 0.0),
-    Source.MODEL: (-5.0, 0.5, 0.3, 0.2, 0.0, 0.5, 0.0, 0.0, 0.0),
-    Source.FILLED: (-4.0, 0.5, 0.3, 0.2, 0.2, 0.5, 0.0, 0.0, 0.0),
+    Source.MEASURED: (-7.084, 2.000, 0.905, 0.025, 0.000, 0.460, 0.000, 0.000, 0.000),
+    Source.MODEL: (-6.958, 2.000, 0.230, 0.258, 0.000, 1.786, 0.150, 0.948, 0.160),
+    Source.FILLED: (-5.659, 2.000, 0.446, 0.060, 0.094, 0.742, 0.000, 0.000, 0.402),
 }
 """Log of the error [m] per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py``."""
 _LEAST_M, _MOST_M = 0.0005, 1.0
