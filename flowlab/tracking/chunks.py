@@ -23,7 +23,8 @@ class ChunkSettings(Settings):
     length: int = Field(default=33, ge=2)
     """Frames of a chunk."""
     stride: int = Field(default=8, ge=1)
-    """Frames from the start of one chunk to the start of the next. 8 is as good as 1 and costs an eighth."""
+    """Frames from the start of one chunk to the start of the next. On eight simulated tasks, as many Lucas-Kanade
+    tracks come within 20 mm with 8 as with 1, to 2 %, at an eighth of the cost."""
 
     @model_validator(mode="after")
     def _overlapping(self) -> "ChunkSettings":
