@@ -16,7 +16,7 @@ _COMMANDS = {
     "grade": ("flowlab.cli.grade:grade", "Measure the error of estimated tracks against known ones."),
     "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
     "validate": ("flowlab.cli.datasets:validate", "Check a dataset for everything that would spoil training."),
-    "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording or a PNG."),
+    "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording, a film or a PNG."),
     "export": ("flowlab.cli.datasets:export", "Write a dataset in another tool's layout."),
 }
 
