@@ -144,9 +144,9 @@ def test_all_kinds_of_points_are_graded(clean: Path) -> None:
     assert role is not None
     share = {r: float((role == r).mean()) for r in Role}
     assert 90 <= len(role) <= 128
-    assert 0.1 < share[Role.BACKGROUND] < 0.25
+    assert 0.35 < share[Role.BACKGROUND] < 0.6
     assert share[Role.OBJECT] >= 0.2
-    assert share[Role.ROBOT] > 0.2
+    assert share[Role.ROBOT] > 0.1
     assert share[Role.MARKER] == 0
 
 

@@ -37,8 +37,8 @@ class QueryMix(Settings):
 
     points: int = Field(default=128, gt=0)
     """Of all kinds together; fewer where something is not in view, or is chosen as two kinds."""
-    background_share: float = Field(default=0.16, ge=0, le=1)
-    """Of floor, walls and table."""
+    background_share: float = Field(default=0.45, ge=0, le=1)
+    """Of floor, walls and table: as many still points as there are in a scene sampled evenly."""
     object_share: float = Field(default=0.20, ge=0, le=1)
     """Of what can move and is not the robot; the rest are of everything but the background."""
     avoid_edges: EdgeSettings | None = None
