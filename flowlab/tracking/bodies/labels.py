@@ -64,7 +64,7 @@ def label(pictures: Pictures, grid: Grid, bodies: Sequence[Body]) -> Labels:
     return Labels(raw, cost)
 
 
-def needed(labels: Labels, margin: float = 0.15) -> list[int]:
+def needed(labels: Labels, margin: float = 0.10) -> list[int]:
     """The motions worth having: dropped, one by one, is what costs its cells little to do without."""
     kept = list(range(len(labels.cost)))
     while len(kept) > 2:
