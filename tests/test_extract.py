@@ -90,11 +90,14 @@ def workers_of(pid: int) -> list[str]:
 
 
 def test_ctrl_c_ends_cleanly_and_resumably(flowlab: Cli, small_dataset: Path, tmp_path: Path) -> None:
-    out = tmp_path / "interrupted"
-    run = start(out)
-    wait_until(lambda: len(list(out.glob("receipts/*.json"))) >= 1)
-    os.killpg(run.pid, signal.SIGINT)
-    _, errors = run.communicate(timeout=60)
+    for attempt in range(4):
+        out = tmp_path / f"interrupted-{attempt}"
+        run = start(out)
+        wait_until(lambda out=out: len(list(out.glob("receipts/*.json"))) >= 1)
+        os.killpg(run.pid, signal.SIGINT)
+        _, errors = run.communicate(timeout=60)
+        if run.returncode != 0:  # on a busy machine the run may be over before the signal comes
+            break
     assert run.returncode == 130
     assert "the same command does the rest" in errors
     assert "Traceback" not in errors
