@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -310,7 +311,10 @@ def test_ctrl_c_ends_cleanly(recordings: Path, tmp_path: Path) -> None:
         "1",
         *SMALL,
     ]
-    run = subprocess.Popen(command, text=True, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    # Jobs in the background of a shell inherit that Ctrl-C is ignored.
+    unignored = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    run = subprocess.Popen(command, text=True, start_new_session=True, preexec_fn=unignored, **pipes)  # type: ignore[call-overload]
     wait_until(lambda: len(list(out.glob("receipts/*.json"))) >= 1)
     os.killpg(run.pid, signal.SIGINT)
     _, errors = run.communicate(timeout=60)
