@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flowlab.errors import DataError
-from flowlab.pipeline.shared_stages import ObserverStage, QueriesStage, WriteStage
+from flowlab.pipeline.shared_stages import ObserverStage, QueriesStage, WriteStage, labelled
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.real.recording import Recording, RecordingSettings, open_recording
 from flowlab.records import Clip, Episode, QueriedDemo, TrackedDemo
@@ -82,26 +82,9 @@ class LiftStage(Stage, LiftSettings):
 
     def process(self, record: TrackedDemo) -> Episode:
         """Lift the tracks by every frame's depth."""
-        seen, queries = record.queried.observed, record.queried.queries
-        demo = seen.demo
         lifting = LiftSettings.model_validate(self.model_dump(exclude={"stage"}))
-        return Episode(
-            task=demo.task,
-            seed=demo.seed,
-            camera=demo.camera,
-            time_s=demo.time_s,
-            point_cloud=seen.points_world,
-            point_count=seen.point_count,
-            state=demo.state,
-            action=demo.action,
-            success=demo.success,
-            queries=queries,
-            tracks=to_3d(clip_of(record.queried), record.tracks, lifting),
-            object_pose=demo.object_pose,
-            depth=seen.depth,
-            rgb=seen.rgb,
-            extras={**demo.extras, "tracker": dict(record.tracker)},
-        )
+        tracks = to_3d(clip_of(record.queried), record.tracks, lifting)
+        return labelled(record.queried, tracks, tracker=dict(record.tracker))
 
 
 class QualityStage(Stage):

@@ -4,7 +4,7 @@ work."""
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,8 +13,30 @@ from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, away_from_edges, sample_queries
 from flowlab.pipeline.stage import Rejected, Stage, Writer
-from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo
+from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo, Tracks3D
 from flowlab.storage.shard import write_shard
+
+
+def labelled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
+    """The episode of a demonstration whose tracks are made: simulated and real ones differ in nothing else."""
+    seen, demo = record.observed, record.observed.demo
+    return Episode(
+        task=demo.task,
+        seed=demo.seed,
+        camera=demo.camera,
+        time_s=demo.time_s,
+        point_cloud=seen.points_world,
+        point_count=seen.point_count,
+        state=demo.state,
+        action=demo.action,
+        success=demo.success,
+        queries=record.queries,
+        tracks=tracks,
+        object_pose=demo.object_pose,
+        depth=seen.depth,
+        rgb=seen.rgb,
+        extras={**demo.extras, **extras},
+    )
 
 
 class ObserverStage(Stage, ObserverSettings):

@@ -4,7 +4,7 @@ from typing import Literal
 
 from flowlab.errors import DataError
 from flowlab.pipeline.memory import return_freed_memory
-from flowlab.pipeline.shared_stages import AcceptStage, ObserverStage, QueriesStage, WriteStage
+from flowlab.pipeline.shared_stages import AcceptStage, ObserverStage, QueriesStage, WriteStage, labelled
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.records import Episode, QueriedDemo
 from flowlab.sim.environment import SceneSettings
@@ -49,24 +49,7 @@ class RigidFlowStage(Stage, RigidFlowSettings):
 
     def process(self, record: QueriedDemo) -> Episode:
         """Follow the queries by the poses of what they lie on."""
-        seen, queries = record.observed, record.queries
-        demo = seen.demo
+        seen, demo = record.observed, record.observed.demo
         assert isinstance(demo, Rollout)
         assert seen.owner is not None
-        return Episode(
-            task=demo.task,
-            seed=demo.seed,
-            camera=demo.camera,
-            time_s=demo.time_s,
-            point_cloud=seen.points_world,
-            point_count=seen.point_count,
-            state=demo.state,
-            action=demo.action,
-            success=demo.success,
-            queries=queries,
-            tracks=label(demo, queries, seen.depth, seen.owner, self),
-            object_pose=demo.object_pose,
-            depth=seen.depth,
-            rgb=seen.rgb,
-            extras=demo.extras,
-        )
+        return labelled(record, label(demo, record.queries, seen.depth, seen.owner, self))
