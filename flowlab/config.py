@@ -1,9 +1,84 @@
-"""The base of every settings model: frozen, and strict about names it does not know."""
+"""Settings: the base of every model of them, and what YAML files and ``--set`` have in common."""
 
-from pydantic import BaseModel, ConfigDict
+from collections.abc import Iterable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from flowlab.errors import UsageError, unknown
 
 
 class Settings(BaseModel):
     """A frozen group of settings. An unknown key is an error, never ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def read_named(kind: str, name: str, folder: str = ".") -> str:
+    """Text of a YAML file, by its path, or by the name of one that comes with flowlab in a folder of ``pipelines``."""
+    path = Path(name)
+    if not path.suffix:
+        known = {p.name.removesuffix(".yaml"): p for p in (_shipped() / folder).iterdir() if p.name.endswith(".yaml")}
+        if name not in known:
+            raise unknown(kind, name, known)
+        return str(known[name].read_text())
+    try:
+        return path.read_text()
+    except OSError as error:
+        raise UsageError(f"{path}: cannot read the {kind} ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path}: cannot read the {kind} (it is no UTF-8 text)") from error
+
+
+def _shipped() -> Any:
+    """``pipelines``: in the package when installed, beside it in a checkout."""
+    installed = files("flowlab") / "pipelines"
+    return installed if installed.is_dir() else Path(__file__).parents[1] / "pipelines"
+
+
+def override(values: dict[str, Any], text: str, known: Iterable[str], example: str) -> None:
+    """Apply ``key.path=value`` to nested settings; the first part must be one of ``known``."""
+    key, equals, _ = text.partition("=")
+    path = key.split(".")
+    if not equals or not all(path):
+        raise UsageError(f"--set {text}: must look like {example}")
+    if path[0] not in known:
+        raise unknown("setting", path[0], known)
+    set_value(values, path, text)
+
+
+def set_value(values: dict[str, Any], path: Sequence[str], text: str) -> None:
+    """Put the YAML value behind the ``=`` of an override at a path of keys."""
+    target, value = values, text.partition("=")[2]
+    for part in path[:-1]:
+        target = target.setdefault(part, {})
+        if not isinstance(target, dict):
+            raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
+    try:
+        target[path[-1]] = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise UsageError(f"--set {text}: not valid YAML: '{value}'") from error
+
+
+def explain(error: ValidationError, model: type[Settings]) -> str:
+    """The first thing wrong, by its path, with what exists where a name does not."""
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        known = _fields_at(model, first["loc"][:-1])
+        return f"{where}: {unknown('setting', str(first['loc'][-1]), known)}"
+    return f"{where}: {first['msg']} (found {first['input']!r})"
+
+
+def _fields_at(model: type[Settings], path: tuple[int | str, ...]) -> list[str]:
+    """Names of the settings of the model that a path of field names leads to."""
+    for part in path:
+        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
+        inner = [a for a in (annotation, *getattr(annotation, "__args__", ())) if isinstance(a, type)]
+        models = [a for a in inner if issubclass(a, Settings)]
+        if models:
+            model = models[0]
+    return [name for name in model.model_fields if name != "stage"]

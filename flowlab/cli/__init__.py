@@ -13,6 +13,7 @@ _COMMANDS = {
     "tasks": ("flowlab.cli.tasks:tasks", "List MetaWorld's 50 tasks."),
     "extract-sim": ("flowlab.cli.extract_sim:extract_sim", "Make a 3D-flow dataset of simulated demonstrations."),
     "track-real": ("flowlab.cli.track_real:track_real", "Make a 3D-flow dataset of RGB-D recordings of a robot."),
+    "train": ("flowlab.cli.train:train", "Train a policy on a dataset: 3D FDP, DP3 or MBA."),
     "grade": ("flowlab.cli.grade:grade", "Measure the error of estimated tracks against known ones."),
     "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
     "validate": ("flowlab.cli.datasets:validate", "Check a dataset for everything that would spoil training."),
@@ -52,7 +53,8 @@ class _Commands(click.Group):
     cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 data invalid; 4 some units failed; 130 interrupted. "
-    "An extraction that ended early, for whatever reason, goes on when the same command is given again.",
+    "An extraction that ended early, for whatever reason, goes on when the same command is given again; a training "
+    "run, with --resume.",
 )
 @click.version_option(__version__)
 def cli() -> None:

@@ -3,12 +3,15 @@
 import json
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from flowlab.learning.trainer import Progress as TrainingProgress
 
 console = Console(stderr=True)
 """For people: progress and logs. Results go to standard output."""
@@ -70,4 +73,50 @@ class ProgressBar:
             fresh = done - self._done_at_start
             left = f", {(now - self._start) / fresh * (total - done):.0f} s left" if fresh else ""
             console.print(f"{note}: {done} of {total} episodes, {now - self._start:.0f} s{left}", highlight=False)
+            self._last_line = now
+
+
+class TrainingBar:
+    """Steps done, speed and time left of a training run: a bar on a terminal, a plain line now and then elsewhere."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=console,
+            speed_estimate_period=300,
+            disable=quiet or not console.is_terminal,
+        )
+        self._task = self._bar.add_task("training", total=None, note="")
+        self._start = self._last_line = time.monotonic()
+        self._first_step: int | None = None
+
+    def __enter__(self) -> "TrainingBar":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._bar.stop()
+
+    def update(self, progress: "TrainingProgress") -> None:
+        """Show how far a run is."""
+        note = f"{progress.samples_per_s:,.0f} windows/s, loss {progress.loss:.4f}"
+        if progress.validation:
+            note += f", held out: action {progress.validation['action_l1']:.4f}"
+        self._bar.update(self._task, completed=progress.step, total=progress.steps, note=note)
+        now = time.monotonic()
+        if self._first_step is None:
+            self._first_step = progress.step
+        if self._quiet or console.is_terminal:
+            return
+        if now - self._last_line > _SECONDS_BETWEEN_LINES or progress.step == progress.steps:
+            left = (now - self._start) / max(progress.step - self._first_step, 1) * (progress.steps - progress.step)
+            known = f", {left:.0f} s left" if progress.step > self._first_step else ""
+            console.print(f"step {progress.step} of {progress.steps}: {note}{known}", highlight=False)
             self._last_line = now

@@ -4,14 +4,12 @@ import importlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import Field, SerializeAsAny, ValidationError, field_validator
 
-from flowlab.config import Settings
+from flowlab.config import Settings, explain, read_named, set_value
 from flowlab.errors import UsageError, unknown
 from flowlab.pipeline.stage import Pipeline, Stage
 
@@ -66,20 +64,8 @@ class Recipe(Settings):
 
 def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     """A recipe by file or by the name of one that comes with flowlab, with ``key.path=value`` overrides."""
-    path = Path(name)
-    if not path.suffix:
-        known = {p.name.removesuffix(".yaml"): p for p in _shipped().iterdir() if p.name.endswith(".yaml")}
-        if name not in known:
-            raise unknown("recipe", name, known)
-        text = known[name].read_text()
-    else:
-        try:
-            text = path.read_text()
-        except OSError as error:
-            raise UsageError(f"{path}: cannot read the recipe ({error.strerror})") from error
-        except UnicodeDecodeError as error:
-            raise UsageError(f"{path}: cannot read the recipe (it is no UTF-8 text)") from error
-    return parse_recipe(text, str(name), overrides)
+    text = read_named("recipe", name)
+    return parse_recipe(text, name, overrides)
 
 
 def parse_recipe(text: str, origin: str, overrides: Iterable[str] = ()) -> Recipe:
@@ -95,17 +81,11 @@ def parse_recipe(text: str, origin: str, overrides: Iterable[str] = ()) -> Recip
     try:
         recipe = Recipe.model_validate(values)
     except ValidationError as error:
-        raise UsageError(f"{origin}: {_explain(error, Recipe)}") from error
+        raise UsageError(f"{origin}: {explain(error, Recipe)}") from error
     except UsageError as error:
         raise UsageError(f"{origin}: {error}") from error
     recipe.pipeline()
     return recipe
-
-
-def _shipped() -> Any:
-    """Folder of the recipes that come with flowlab: in the package when installed, beside it in a checkout."""
-    installed = files("flowlab") / "pipelines"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "pipelines"
 
 
 def _make_stage(values: Any) -> Stage:
@@ -118,7 +98,7 @@ def _make_stage(values: Any) -> Stage:
     try:
         return cls.model_validate(dict(values))
     except ValidationError as error:
-        raise UsageError(f"stage '{name}': {_explain(error, cls)}") from error
+        raise UsageError(f"stage '{name}': {explain(error, cls)}") from error
 
 
 def _own_stage(name: str) -> type[Stage]:
@@ -139,7 +119,7 @@ def _load(place: str) -> type[Stage]:
 
 def _override(values: dict[str, Any], text: str) -> None:
     """Apply ``observer.points=512``: the first part is a stage's name or a key of the recipe."""
-    key, equals, value = text.partition("=")
+    key, equals, _ = text.partition("=")
     stages = {s["stage"]: s for s in values.get("stages") or () if isinstance(s, dict) and "stage" in s}
     # A stage named by import path has dots of its own.
     whole = next((name for name in stages if key.startswith(f"{name}.")), None)
@@ -149,35 +129,7 @@ def _override(values: dict[str, Any], text: str) -> None:
     known = [*stages, *(k for k in Recipe.model_fields if k != "stages")]
     if first not in known:
         raise unknown("stage or key of this recipe", first, known)
-    target, path = (stages[first], rest) if first in stages else (values, [first, *rest])
-    if not path:
+    if first in stages and not rest:
         raise UsageError(f"--set {text}: '{first}' is a stage; name one of its settings")
-    for part in path[:-1]:
-        target = target.setdefault(part, {})
-        if not isinstance(target, dict):
-            raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
-    try:
-        target[path[-1]] = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise UsageError(f"--set {text}: not valid YAML: '{value}'") from error
-
-
-def _explain(error: ValidationError, model: type[Settings]) -> str:
-    """The first thing wrong, by its path, with what exists where a name does not."""
-    first = error.errors()[0]
-    where = ".".join(map(str, first["loc"]))
-    if first["type"] == "extra_forbidden":
-        known = _fields_at(model, first["loc"][:-1])
-        return f"{where}: {unknown('setting', str(first['loc'][-1]), known)}"
-    return f"{where}: {first['msg']} (found {first['input']!r})"
-
-
-def _fields_at(model: type[Settings], path: tuple[int | str, ...]) -> list[str]:
-    """Names of the settings of the model that a path of field names leads to."""
-    for part in path:
-        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
-        inner = [a for a in (annotation, *getattr(annotation, "__args__", ())) if isinstance(a, type)]
-        models = [a for a in inner if issubclass(a, Settings)]
-        if models:
-            model = models[0]
-    return [name for name in model.model_fields if name != "stage"]
+    target, path = (stages[first], rest) if first in stages else (values, [first, *rest])
+    set_value(target, path, text)

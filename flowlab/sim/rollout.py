@@ -10,6 +10,7 @@ from pydantic import Field
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError
+from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import pose_9d, rigid
 from flowlab.records import Demonstration, Frame
 from flowlab.sim.environment import SceneSettings, Simulation, dp3_camera
@@ -53,6 +54,19 @@ class Rollout(Demonstration):
         return replace(self.renderer.frame(self.poses.at(t)), camera=self.camera)
 
 
+@dataclass(frozen=True, slots=True)
+class Live:
+    """The simulation's camera, now."""
+
+    simulation: Simulation
+    renderer: Renderer
+    camera: Camera
+
+    def frame(self) -> Frame:
+        """The picture of this moment."""
+        return replace(self.renderer.frame(self.simulation.poses()), camera=self.camera)
+
+
 class Studio:
     """One task's simulation with its geometry packed: made once, used for any number of episodes."""
 
@@ -73,6 +87,14 @@ class Studio:
 
             self._gl = GLRenderer(sim.scene, sim.camera(), sim.settings)
         return self._gl
+
+    def live(self) -> "Live":
+        """A look at the simulation as it goes on from its last reset."""
+        sim = self.simulation
+        camera = sim.camera()
+        if sim.settings.convention == "dp3":
+            camera, _ = dp3_camera(camera)
+        return Live(sim, self.renderer(sim.poses()), camera)
 
     def record_expert(self, seed: int, settings: ExpertSettings) -> Rollout:
         """Let the expert solve the layout of ``seed``, or try to until ``max_steps``.

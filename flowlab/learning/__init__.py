@@ -1,0 +1,1 @@
+"""Policies: training them, and what training needs."""

@@ -1,0 +1,247 @@
+"""From demonstrations to batches: which windows a training step sees, and their tensors."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from flowlab.errors import DataError, UsageError
+from flowlab.geometry.sampling import farthest_points
+from flowlab.learning.corpus import Corpus
+from flowlab.learning.layout import Layout
+from flowlab.learning.settings import MotionSettings, TrainSettings
+from flowlab.perception.observer import pad
+from flowlab.records import Role
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a policy decides on, for W windows that share F frames."""
+
+    points: Tensor
+    """(F, N, 3) [m], world frame."""
+    state: Tensor
+    """(F, S)."""
+    observed: Tensor
+    """(W, history): the frames of each window, the last is now."""
+    queries: Tensor
+    """(W, M, 3) [m], world frame: where each query point was when its episode began."""
+    task: Tensor
+    """(W,): index of the task."""
+
+
+@dataclass(frozen=True, slots=True)
+class Batch(Context):
+    """A context, and what followed in the demonstrations. Row k of every sequence is action k of the window."""
+
+    action: Tensor
+    """(W, T, A)."""
+    action_weight: Tensor
+    """(W, T): 0 where the demonstration has no such step; the mean over the whole batch is 1."""
+    flow: Tensor
+    """(W, T, M, 3) [m]: how far each query point moves during each action."""
+    flow_weight: Tensor
+    """(W, T, M): less where the label is less sure; the mean over the whole batch is 1."""
+    object_pose: Tensor
+    """(W, T, 9)."""
+
+    def part(self, windows: slice) -> "Batch":
+        """Some of the windows, with the frames they need. The weights stay those of the whole batch."""
+        if windows == slice(0, len(self.observed)):
+            return self
+        frame, observed = torch.unique(self.observed[windows], return_inverse=True)
+        mine = {f.name: getattr(self, f.name)[windows] for f in fields(self)}
+        return Batch(**mine | {"points": self.points[frame], "state": self.state[frame], "observed": observed})
+
+    def to(self, device: torch.device) -> "Batch":
+        """The same on another device."""
+        return Batch(**{f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)})
+
+
+@dataclass(frozen=True, slots=True)
+class Windows:
+    """Some windows of a corpus, in runs of consecutive ones."""
+
+    demo: Int[np.ndarray, "W"]
+    now: Int[np.ndarray, "W"]
+    """Row of the corpus of the frame that the action is decided at."""
+    run: Int[np.ndarray, "W"]
+    """Which run each belongs to."""
+
+
+def all_windows(corpus: Corpus, demos: list[int], executed: int) -> Windows:
+    """Every window of some demonstrations: actions are decided on up to ``executed`` steps before the end (DP3)."""
+    length = [max(1, len(corpus.demos[d]) - executed + 1) for d in demos]
+    now = [corpus.demos[d].start + np.arange(n) for d, n in zip(demos, length, strict=True)]
+    return Windows(np.repeat(demos, length), np.concatenate(now), np.zeros(sum(length), int))
+
+
+class Sampler:
+    """The windows of every training step, a function of (seed, step) alone.
+
+    Each epoch cuts all windows into runs, elsewhere than the epoch before, and deals the runs out in random order.
+    """
+
+    def __init__(self, windows: Windows, size: int, segment: int, seed: int) -> None:
+        self._windows = windows
+        self._segment = min(segment, len(windows.now))
+        self._runs = size // segment
+        self._seed = seed
+        self._runs_per_epoch = len(windows.now) // self._segment
+
+    @property
+    def steps_per_epoch(self) -> float:
+        """Steps that see every window once."""
+        return self._runs_per_epoch / self._runs
+
+    def windows(self, step: int) -> Windows:
+        """The windows of a step."""
+        number = step * self._runs + np.arange(self._runs)
+        epoch, position = np.divmod(number, self._runs_per_epoch)
+        start = np.empty(self._runs, int)
+        for e in np.unique(epoch):
+            rng = np.random.default_rng([self._seed, int(e)])
+            phase, order = rng.integers(self._segment), rng.permutation(self._runs_per_epoch)
+            start[epoch == e] = phase + order[position[epoch == e]] * self._segment
+        index = (start[:, None] + np.arange(self._segment)).reshape(-1) % len(self._windows.now)
+        run = np.repeat(np.arange(self._runs), self._segment)
+        return Windows(self._windows.demo[index], self._windows.now[index], run)
+
+
+class Gatherer:
+    """Makes batches of windows; with a random generator it also varies them, as the settings say."""
+
+    def __init__(self, corpus: Corpus, layout: Layout, settings: TrainSettings, tasks: tuple[str, ...]) -> None:
+        if settings.encoder.points > corpus.points.shape[1]:
+            raise UsageError(
+                f"encoder.points is {settings.encoder.points}, and the dataset's clouds have {corpus.points.shape[1]}; "
+                f"add --set encoder.points={corpus.points.shape[1]}, or extract with --set observer.points="
+                f"{settings.encoder.points}"
+            )
+        self._corpus, self._layout, self._settings = corpus, layout, settings
+        self._tasks = np.array([tasks.index(d.task) for d in corpus.demos])
+        self._start = np.array([d.start for d in corpus.demos])
+        self._stop = np.array([d.stop for d in corpus.demos])
+        flow = settings.policy == "fdp"
+        self._queries = choose_queries(corpus, settings.motion) if flow else np.zeros((len(corpus.demos), 0), int)
+        self._weight = _label_weight(corpus, settings.motion) if flow else np.zeros((len(corpus.state), 0), np.float32)
+
+    def gather(self, windows: Windows, rng: np.random.Generator | None = None) -> Batch:
+        """The batch of some windows."""
+        corpus, s = self._corpus, self._settings
+        first, last = self._start[windows.demo], self._stop[windows.demo] - 1
+        history = np.clip(windows.now[:, None] + np.arange(1 - s.history, 1), first[:, None], None)
+        # Frames are shared within a run only, since every run may be shifted by its own amount.
+        key, observed = np.unique(windows.run[:, None] * len(corpus.state) + history, return_inverse=True)
+        run_of_frame, frame = np.divmod(key, len(corpus.state))
+        ahead = windows.now[:, None] + np.arange(1 - s.history, s.horizon - s.history + 1)
+        row = np.clip(ahead, first[:, None], last[:, None])
+        demonstrated = ahead == row
+        query, columns = self._query_subset(rng)
+        points, state = corpus.points[frame[:, None], columns], corpus.state[frame].copy()
+        flow, flow_weight = self._flow(windows.demo, row, last, demonstrated, query)
+        queries = np.take_along_axis(corpus.queries, self._queries[:, query, None], 1)[windows.demo]
+        action, pose = corpus.action[row], corpus.object_pose[row]
+        if rng is not None and s.batch.shift_m:
+            shift = rng.uniform(-s.batch.shift_m, s.batch.shift_m, (windows.run.max() + 1, 3)).astype(np.float32)
+            shift[:, 2] = 0
+            of_frame, of_window = shift[run_of_frame], shift[windows.run]
+            points = points + of_frame[:, None]
+            queries = queries + of_window[:, None]
+            for place in self._layout.state_places:
+                state[:, place] += of_frame
+            if self._layout.action_place is not None:
+                action[..., self._layout.action_place] += of_window[:, None]
+            if pose.shape[-1]:
+                pose[..., :3] += of_window[:, None]
+        return Batch(
+            **_tensors(
+                points=points,
+                state=state,
+                observed=observed.reshape(history.shape),
+                queries=queries,
+                task=self._tasks[windows.demo],
+                action=action,
+                action_weight=_mean_one((demonstrated | s.batch.pad).astype(np.float32)),
+                flow=flow,
+                flow_weight=flow_weight,
+                object_pose=pose,
+            )
+        )
+
+    def _query_subset(self, rng: np.random.Generator | None) -> tuple[Any, Any]:
+        """Which of the queries and which of the points this batch sees."""
+        s = self._settings
+        query: Any = slice(None)
+        points = np.arange(s.encoder.points)
+        if rng is not None and s.encoder.subset is not None:
+            points = rng.permutation(s.encoder.points)[: s.encoder.subset]
+        if rng is not None and s.motion.subset is not None and s.motion.layout == "per-query":
+            query = rng.permutation(self._queries.shape[1])[: s.motion.subset]
+        return query, points
+
+    def _flow(
+        self, demo: np.ndarray, row: np.ndarray, last: np.ndarray, demonstrated: np.ndarray, query: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Flow of every window's queries during each of its actions, and how much each counts."""
+        then = np.minimum(row + 1, last[:, None])
+        column = self._queries[demo][:, None, query]
+        tracks, weight = self._corpus.tracks, self._weight
+        flow = tracks[then[..., None], column] - tracks[row[..., None], column]
+        sure = np.minimum(weight[row[..., None], column], weight[then[..., None], column])
+        # Nothing is known of how points move during the last action, or before and after the demonstration.
+        known = (then > row) & demonstrated
+        flow[~known] = 0
+        return flow, _mean_one(sure * known[..., None])
+
+
+def choose_queries(corpus: Corpus, settings: MotionSettings) -> Int[np.ndarray, "D M"]:
+    """Which of a dataset's query points each demonstration is trained with.
+
+    ``scene`` takes the first M where the dataset was extracted with that sampling, which is the farthest-point sample
+    of M. Raises :class:`DataError` where the dataset has too few, or none of the kind asked for.
+    """
+    held = corpus.queries.shape[1]
+    if settings.points > held:
+        raise DataError(
+            f"motion.points is {settings.points}, and the dataset has {held} query points; add --set motion.points="
+            f"{held}, or make the dataset with --set queries.points={settings.points}"
+            if held
+            else "the dataset has no query points, and fdp learns from how they move; train --policy dp3"
+        )
+    return np.stack([_choose(corpus, k, settings) for k in range(len(corpus.demos))])
+
+
+def _choose(corpus: Corpus, demo: int, settings: MotionSettings) -> np.ndarray:
+    count, wanted = int(corpus.query_count[demo, 0]), settings.points
+    xyz, role = corpus.queries[demo, :count], corpus.query_role[demo, :count]
+    if settings.sampling == "scene":
+        return pad(farthest_points(xyz, wanted), wanted)
+    movable = np.flatnonzero(role == Role.OBJECT)
+    if not len(movable):
+        where = corpus.demos[demo]
+        raise DataError(
+            f"{where.task} seed {where.seed}: none of its {count} query points is known to lie on an object; use "
+            "--set motion.sampling=scene, or make the dataset with --set queries.sampling=stratified"
+        )
+    chosen = movable[farthest_points(xyz[movable], wanted if settings.sampling == "object" else -(-wanted // 3))]
+    if settings.sampling == "stratified":
+        chosen = np.concatenate([chosen, farthest_points(xyz, wanted - len(chosen), chosen)])
+    return pad(chosen, wanted)
+
+
+def _label_weight(corpus: Corpus, settings: MotionSettings) -> np.ndarray:
+    """How much the position of every query point counts at every frame: (F, Q)."""
+    seen = np.where(corpus.visible, 1.0, settings.occluded_weight)
+    return (seen / (1 + (corpus.sigma / settings.sigma_m) ** 2)).astype(np.float32)
+
+
+def _mean_one(weight: np.ndarray) -> np.ndarray:
+    return weight / max(float(weight.mean()), 1e-9) if weight.size else weight
+
+
+def _tensors(**arrays: np.ndarray) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}

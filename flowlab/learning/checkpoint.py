@@ -1,0 +1,219 @@
+"""A training run on disk: what a policy is (JSON), its weights (safetensors), and what resuming needs."""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy
+import safetensors
+import torch
+from pydantic import ValidationError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from flowlab import __version__
+from flowlab.config import Settings, explain
+from flowlab.errors import DataError, UsageError
+from flowlab.learning.policy import Policy, PolicySpec
+from flowlab.learning.source import Source
+from flowlab.storage.files import read_json, remove_leftovers, temporary_path, write_json
+from flowlab.storage.manifest import differences
+
+POLICY = "policy.json"
+RUN = "run.json"
+RESUME = "resume.safetensors"
+CHECKPOINTS = "checkpoints"
+_FORMAT = 1
+Model = TypeVar("Model", bound=Settings)
+
+
+class Trained(Settings):
+    """``policy.json``: what a policy is, and what it was trained on."""
+
+    format: int = _FORMAT
+    policy: PolicySpec
+    dataset: str
+    """Path of the dataset as it was given."""
+    fingerprint: str
+    """Of the dataset's content."""
+    versions: Mapping[str, str]
+    """Of what it was trained with."""
+
+    @classmethod
+    def now(cls, policy: PolicySpec, source: Source) -> "Trained":
+        """A policy trained on a source by this flowlab."""
+        versions = {"flowlab": __version__, "torch": torch.__version__, "numpy": numpy.__version__}
+        return cls(policy=policy, dataset=str(source.path), fingerprint=source.fingerprint, versions=versions)
+
+
+class Run(Settings):
+    """``run.json``: how a run goes; written when it begins, it stays the same until it ends."""
+
+    dataset: Path
+    steps: int
+    train: tuple[int, ...]
+    """Demonstrations trained on, by their position in the corpus."""
+    held_out: tuple[int, ...]
+    threads: int
+    device: str
+    precision: str
+    logs: tuple[str, ...]
+    began_from: str | None
+    """Checkpoint that the first weights are from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A policy from disk, ready for use."""
+
+    policy: Policy
+    trained: Trained
+    step: int
+    """Training steps its weights have seen."""
+    path: Path
+    """Of the weights."""
+
+
+def load_policy(path: Path, device: str = "cpu") -> Loaded:
+    """The policy of a run, with its newest weights, or of one checkpoint of it.
+
+    Raises :class:`DataError` where there is none, or it is damaged.
+    """
+    weights = path if path.suffix == ".safetensors" else _newest(path)
+    trained = read_trained(weights.parents[1])
+    tensors, about = _read(weights)
+    policy = Policy(trained.policy).requires_grad_(False).eval()
+    try:
+        policy.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise DataError(f"{weights}: does not fit {weights.parents[1] / POLICY}; restore both from one run") from error
+    return Loaded(policy.to(device), trained, int(about["step"]), weights)
+
+
+def read_trained(folder: Path) -> Trained:
+    """``policy.json`` of a run."""
+    path = folder / POLICY
+    if not path.exists():
+        raise DataError(f"{folder}: not a training run (it has no {POLICY})")
+    return _validated(Trained, path)
+
+
+def read_run(folder: Path) -> Run:
+    """``run.json`` of a run."""
+    path = folder / RUN
+    if not path.exists():
+        raise DataError(f"{folder}: no run to resume (it has no {RUN}); start one with 'flowlab train DATASET --out'")
+    return _validated(Run, path)
+
+
+def check_observer(trained: Trained, where: Path, source: Source) -> None:
+    """Refuse data whose clouds were made with other settings than those a policy knows, showing the difference."""
+    mine, theirs = trained.policy.observer, source.observer
+    if mine is None and theirs is None:
+        return
+    lines = list(differences(json.loads(json.dumps(theirs)), json.loads(json.dumps(mine)), "observer"))
+    if lines:
+        raise DataError(
+            f"{source.path}: its point clouds were made with other settings than those that {where} was trained with; "
+            "make the dataset again with the policy's, or train a new policy:\n  "
+            + "\n  ".join(line.replace("this run has", "the policy has") for line in lines)
+        )
+
+
+def keep_weights(folder: Path, policy: Policy, step: int) -> Path:
+    """Keep the weights of a policy as a checkpoint of a run."""
+    path = folder / CHECKPOINTS / f"step-{step:08d}.safetensors"
+    path.parent.mkdir(exist_ok=True)
+    remove_leftovers(path.parent)
+    _write(path, policy.state_dict(), {"step": str(step)})
+    return path
+
+
+def keep_resume(folder: Path, step: int, groups: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Keep everything that goes on changing: named groups of tensors, as they are after ``step`` steps."""
+    tensors = {f"{group}:{name}": value for group, values in groups.items() for name, value in values.items()}
+    _write(folder / RESUME, tensors, {"step": str(step)})
+
+
+def read_resume(folder: Path) -> tuple[int, dict[str, dict[str, Tensor]]]:
+    """The step, and the groups of :func:`keep_resume`."""
+    path = folder / RESUME
+    if not path.exists():
+        raise DataError(
+            f"{folder}: nothing to resume (it has no {RESUME}); the run had not got that far, so start anew"
+        )
+    tensors, about = _read(path)
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        group, _, rest = name.partition(":")
+        groups.setdefault(group, {})[rest] = value
+    return int(about["step"]), groups
+
+
+@contextmanager
+def room_to_write(folder: Path) -> Iterator[None]:
+    """Turns a failure to write into a sentence; what was there before is whole."""
+    try:
+        yield
+    except (OSError, safetensors.SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise DataError(
+            f"{folder}: cannot be written ({reason}); what was kept before is whole. Make room, then go on with "
+            f"'flowlab train {folder} --resume'"
+        ) from error
+
+
+def start_folder(folder: Path, trained: Trained, run: Run) -> None:
+    """Make the folder of a new run. Raises :class:`UsageError` where there is one already."""
+    if (folder / RUN).exists() or (folder / POLICY).exists():
+        raise UsageError(
+            f"{folder}: holds a run already; go on with 'flowlab train {folder} --resume', or choose another --out"
+        )
+    with room_to_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / POLICY, json.loads(trained.model_dump_json()))
+        write_json(folder / RUN, json.loads(run.model_dump_json()))
+
+
+def _newest(run: Path) -> Path:
+    read_trained(run)
+    kept = sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
+    if not kept:
+        raise DataError(f"{run}: has no checkpoint yet; resume it with 'flowlab train {run} --resume'")
+    return kept[-1]
+
+
+def _write(path: Path, tensors: Mapping[str, Tensor], about: dict[str, str]) -> None:
+    temporary = temporary_path(path)
+    try:
+        with room_to_write(path.parent if path.name == RESUME else path.parents[1]):
+            save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, about)
+            os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    if not path.exists():
+        raise DataError(f"{path}: there is no such checkpoint")
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            about = file.metadata() or {}
+        return load_file(path), about
+    except (OSError, safetensors.SafetensorError) as error:
+        raise DataError(f"{path}: damaged ({error}); delete it to use the checkpoint before it") from error
+
+
+def _validated(model: type[Model], path: Path) -> Model:
+    values: Any = read_json(path)
+    found = values.get("format", _FORMAT) if isinstance(values, dict) else None
+    if found != _FORMAT:
+        raise DataError(f"{path}: format is {found}, this flowlab reads {_FORMAT}; use the flowlab that wrote it")
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise DataError(f"{path}: {explain(error, model)}") from error

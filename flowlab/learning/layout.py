@@ -1,0 +1,53 @@
+"""Which numbers of state and action are places in the world, so that they can be shifted and given relatively."""
+
+import numpy as np
+
+from flowlab.config import Settings
+from flowlab.learning.corpus import Corpus
+from flowlab.learning.source import Source
+
+_NEAR_M = 0.1
+"""The gripper is taken to be where the state says if, in the median, a point of the cloud is this near."""
+_REACHED_M = 0.02
+"""Actions are taken to be places if, in the median, the gripper is this near to them a step later."""
+
+
+class Layout(Settings):
+    """Triples of channels that are places in the world frame [m]."""
+
+    gripper: tuple[int, int, int] | None = None
+    """Of the state: where the gripper is; None where that is not known."""
+    state_places: tuple[tuple[int, int, int], ...] = ()
+    """Of the state: every place, the gripper's too."""
+    action_place: tuple[int, int, int] | None = None
+    """Of the action: where the gripper is sent to; None where actions are displacements or not known."""
+
+
+def find_layout(source: Source, corpus: Corpus) -> Layout:
+    """The layout of a dataset: known for simulation, measured for recordings, unknown in DP3's frame.
+
+    DP3 gives clouds in its camera's frame and the state in the world's.
+    """
+    first = (0, 1, 2)
+    if "expert" in source.settings:
+        if source.settings["expert"]["scene"]["convention"] == "dp3":
+            return Layout()
+        return Layout(gripper=first, state_places=(first, (3, 4, 5), (6, 7, 8)))
+    if not source.settings or corpus.state.shape[1] < 3 or not _gripper_is_seen(corpus):
+        return Layout()
+    places = corpus.action.shape[1] >= 3 and _actions_are_places(corpus)
+    return Layout(gripper=first, state_places=(first,), action_place=first if places else None)
+
+
+def _gripper_is_seen(corpus: Corpus) -> bool:
+    rows = np.linspace(0, len(corpus.state) - 1, min(len(corpus.state), 200)).astype(int)
+    nearest = [np.linalg.norm(corpus.points[r] - corpus.state[r, :3], axis=1).min() for r in rows]
+    return bool(np.median(nearest) < _NEAR_M)
+
+
+def _actions_are_places(corpus: Corpus) -> bool:
+    apart = [
+        np.linalg.norm(corpus.action[d.start : d.stop - 1, :3] - corpus.state[d.start + 1 : d.stop, :3], axis=1)
+        for d in corpus.demos
+    ]
+    return bool(np.median(np.concatenate(apart)) < _REACHED_M)

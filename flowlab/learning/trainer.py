@@ -1,0 +1,158 @@
+"""The training loop."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from flowlab.errors import DataError, FlowlabError
+from flowlab.learning.batches import Gatherer, Sampler, all_windows
+from flowlab.learning.checkpoint import Run, keep_resume, keep_weights, room_to_write
+from flowlab.learning.corpus import Corpus
+from flowlab.learning.diffusion import Draws
+from flowlab.learning.metrics import Means, Metrics
+from flowlab.learning.optimising import Average, Optimisers
+from flowlab.learning.policy import Policy
+from flowlab.learning.processes import Processes
+from flowlab.learning.validation import validate
+
+_STEPS_PER_LINE = 50
+"""Training steps behind one line of metrics."""
+_SECONDS_BETWEEN_SAVES = 300.0
+"""At least so often, what resuming needs is kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a run is."""
+
+    step: int
+    steps: int
+    samples_per_s: float
+    loss: float
+    validation: dict[str, float] | None
+    """The newest errors on held-out demonstrations."""
+
+
+class Diverged(FlowlabError):
+    """The loss is no longer a number."""
+
+
+class Trainer:
+    """Trains one policy on one corpus, in one or several processes."""
+
+    def __init__(self, folder: Path, run: Run, policy: Policy, corpus: Corpus, processes: Processes) -> None:
+        settings = policy.spec.settings
+        self.folder, self.run, self.policy, self.processes = folder, run, policy.to(processes.device), processes
+        self.settings = settings
+        self.average = Average(policy, settings.optimiser)
+        self.optimisers = Optimisers(policy, settings.optimiser, run.steps)
+        self._network = processes.wrap(policy)
+        self._gatherer = Gatherer(corpus, policy.spec.layout, settings, policy.spec.tasks)
+        windows = all_windows(corpus, list(run.train), settings.executed)
+        self._sampler = Sampler(windows, settings.batch.windows, settings.batch.segment, settings.run.seed)
+        self._looked_at = all_windows(corpus, list(run.held_out), settings.executed) if run.held_out else None
+        self.step = 0
+
+    def train_step(self) -> dict[str, float]:
+        """One step: the losses, averaged over all processes.
+
+        Raises :class:`Diverged`, before the weights change, where they are not finite.
+        """
+        seed = np.random.SeedSequence([self.settings.run.seed, self.step])
+        batch = self._gatherer.gather(self._sampler.windows(self.step), np.random.default_rng(seed))
+        windows = len(batch.observed)
+        part = self.processes.part(windows)
+        generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+        draws = Draws(generator, self.processes.device, part)
+        with self.processes.autocast():
+            losses = self._network(batch.part(part).to(self.processes.device), draws, windows)
+        values = {"loss": losses.total, "action_loss": losses.action}
+        if losses.motion is not None:
+            values["motion_loss"] = losses.motion
+        numbers = self.processes.mean({k: v.detach() for k, v in values.items()})
+        if not all(np.isfinite(v) for v in numbers.values()):
+            raise Diverged(
+                f"{self.folder}: the loss is {numbers['loss']} at step {self.step}; the last checkpoint is whole. "
+                "Lower optimiser.learning_rate and start anew, or look at the data with 'flowlab validate'"
+            )
+        losses.total.backward()
+        self.optimisers.update(self.step)
+        self.average.update(self.policy, self.step)
+        self.step += 1
+        return numbers
+
+    def fit(
+        self,
+        metrics: Metrics | None,
+        report: Callable[[Progress], None],
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train to the end of the run; False where ``should_stop`` ended it earlier, to be resumed."""
+        looks = _evenly(self.run.steps, self.settings.run.validations) if self._looked_at is not None else set()
+        keeps = _evenly(self.run.steps, self.settings.run.checkpoints)
+        means, last = Means(), None
+        began, last_save, done_before = time.monotonic(), time.monotonic(), self.step
+        while self.step < self.run.steps:
+            means.add(self.train_step())
+            at_line = self.step % _STEPS_PER_LINE == 0 or self.step == self.run.steps
+            if at_line:
+                rate = (self.step - done_before) * self.settings.batch.windows / (time.monotonic() - began)
+                averages = means.take()
+                learning_rate = self.optimisers.learning_rate(self.step - 1)
+                self._note(metrics, "train", averages | {"lr": learning_rate, "samples_per_s": rate})
+            if self.step in looks:
+                last = self.validate()
+                self._note(metrics, "validation", last)
+            if at_line:
+                report(Progress(self.step, self.run.steps, rate, averages["loss"], last))
+            stop = self.processes.agree(should_stop())
+            if self.step in keeps:
+                self._keep(self.step)
+            if stop or self.processes.agree(at_line and time.monotonic() - last_save > _SECONDS_BETWEEN_SAVES):
+                self._keep(None)
+                last_save = time.monotonic()
+            if stop and self.step < self.run.steps:
+                return False
+        return True
+
+    def validate(self) -> dict[str, float]:
+        """Errors of the averaged weights on held-out demonstrations."""
+        assert self._looked_at is not None
+        return validate(self.average.policy, self._gatherer, self._looked_at, self.processes.device)
+
+    def _note(self, metrics: Metrics | None, kind: str, values: dict[str, float]) -> None:
+        if metrics is not None:
+            with room_to_write(self.folder):
+                metrics.write(kind, self.step, values)
+
+    def _keep(self, checkpoint: int | None) -> None:
+        """Keep what resuming needs, and the weights as a checkpoint."""
+        if not self.processes.is_first:
+            return
+        if checkpoint is not None:
+            keep_weights(self.folder, self.average.policy, checkpoint)
+        groups = {
+            "policy": self.policy.state_dict(),
+            "average": self.average.policy.state_dict(),
+            "optimiser": self.optimisers.state(),
+        }
+        keep_resume(self.folder, self.step, groups)
+
+    def take_up(self, step: int, groups: dict[str, dict[str, torch.Tensor]]) -> None:
+        """Go on from what :func:`~flowlab.learning.checkpoint.read_resume` gives."""
+        try:
+            self.policy.load_state_dict(groups["policy"])
+            self.average.policy.load_state_dict(groups["average"])
+            self.optimisers.load(groups["optimiser"])
+        except (KeyError, RuntimeError) as error:
+            raise DataError(f"{self.folder}: its resume file does not fit its policy.json; start anew") from error
+        self.step = step
+
+
+def _evenly(steps: int, times: int) -> set[int]:
+    """The steps after which something happens so many times, the last time at the end."""
+    return {round(steps * k / times) for k in range(1, times + 1)}
