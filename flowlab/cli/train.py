@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     "--policy", help="fdp (3D Flow Diffusion Policy), dp3 (3D Diffusion Policy) or mba (Motion Before Action)."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the run.")
-@click.option("--profile", default="fast", show_default=True, help="fast, paper, or a YAML file with all settings.")
+@click.option("--profile", help="fast, paper, or a YAML file with all settings  [fast].")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Train as long as this; see --help's end.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: motion.points=50.")
 @click.option("--seed", type=click.IntRange(min=0), help="Short for --set run.seed=...")
@@ -38,7 +38,7 @@ def train(
     source: Path,
     policy: str | None,
     out: Path | None,
-    profile: str,
+    profile: str | None,
     minutes: float | None,
     overrides: tuple[str, ...],
     seed: int | None,
@@ -67,8 +67,8 @@ def train(
     Ended early, a run goes on with --resume as if it had never stopped.
     """
     if resume:
-        given = {"--policy": policy, "--out": out, "--minutes": minutes, "--set": overrides, "--seed": seed,
-                 "--overfit": overfit, "--from": began_from}  # fmt: skip
+        given = {"--policy": policy, "--out": out, "--profile": profile, "--minutes": minutes, "--set": overrides,
+                 "--seed": seed, "--overfit": overfit, "--from": began_from}  # fmt: skip
         if changed := [name for name, value in given.items() if value not in (None, ())]:
             raise UsageError(f"--resume goes on as the run began, so leave out {', '.join(changed)}")
     elif policy is None or out is None:
@@ -86,9 +86,9 @@ def train(
     else:
         assert policy is not None
         assert out is not None
-        changes = [f"run.minutes={minutes}"] if minutes else []
+        changes = [f"run.minutes={minutes}", "run.steps=null"] if minutes else []
         changes += [f"run.seed={seed}"] if seed is not None else []
-        settings = load_settings(profile, policy, [*overrides, *changes])
+        settings = load_settings(profile or "fast", policy, [*overrides, *changes])
         trainer = runs.prepare(source, out, settings, runs.Machine(**machine), overfit=overfit, began_from=began_from)
     first = trainer.processes.is_first
     if first and not as_json:
@@ -110,22 +110,24 @@ def _describe(trainer: "Trainer") -> None:
         f"{len(run.train)} demonstrations of {', '.join(spec.tasks)}; {len(run.held_out)} held out; "
         f"{trainer.processes.description}",
         highlight=False,
+        soft_wrap=True,
     )
     if spec.settings.encoder.relative and spec.layout.gripper is None:
         console.print(
-            "points are given in the world frame: the data do not tell where in it the gripper is", highlight=False
+            "points are given in the world frame: the data do not tell where in it the gripper is",
+            highlight=False,
+            soft_wrap=True,
         )
 
 
 def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
     """Draw the curve, and print what came out."""
+    from flowlab.learning.checkpoint import room_to_write
     from flowlab.learning.metrics import METRICS, last_of
     from flowlab.viz.curve import draw_curve
 
     folder = trainer.folder
     metrics = folder / METRICS
-    if trainer.step:
-        draw_curve(metrics, folder / "curve.png")
     report: dict[str, Any] = {
         "run": str(folder),
         "policy": trainer.settings.policy,
@@ -135,18 +137,31 @@ def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
         "training": last_of(metrics, "train"),
         "validation": last_of(metrics, "validation"),
     }
+    if report["training"] or report["validation"]:
+        with room_to_write(folder):
+            draw_curve(metrics, folder / "curve.png")
     if as_json:
         print_json(report)
         return
     if report["validation"]:
-        rows = [[name, value] for name, value in report["validation"].items()]
-        print_table(["on held-out demonstrations", "value"], rows)
+        print_table(
+            ["on held-out demonstrations", "policy", "doing nothing", "going on as before"], _rows(report["validation"])
+        )
     if not finished:
         click.echo(
             f"stopped at step {trainer.step} of {trainer.run.steps}; go on with: flowlab train {folder} --resume"
         )
     else:
         click.echo(f"{folder}: trained for {trainer.step} steps; the curve is {folder / 'curve.png'}")
+
+
+def _rows(errors: dict[str, float]) -> list[list[object]]:
+    """Each error beside the two that cost nothing."""
+    names = [name for name in errors if not name.endswith(("_zero", "_hold", "_constant"))]
+    return [
+        [name, errors[name], errors[f"{name}_zero"], errors.get(f"{name}_hold", errors.get(f"{name}_constant", ""))]
+        for name in names
+    ]
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from flowlab.geometry.sampling import farthest_points
 from flowlab.learning.corpus import Corpus
 from flowlab.learning.layout import Layout
 from flowlab.learning.settings import MotionSettings, TrainSettings
+from flowlab.learning.variation import Moves
 from flowlab.perception.observer import pad
 from flowlab.records import Role
 
@@ -125,6 +126,7 @@ class Gatherer:
         self._tasks = np.array([tasks.index(d.task) for d in corpus.demos])
         self._start = np.array([d.start for d in corpus.demos])
         self._stop = np.array([d.stop for d in corpus.demos])
+        self._centre = corpus.state[:, layout.gripper].mean(0) if layout.gripper else np.zeros(3)
         flow = settings.policy == "fdp"
         self._queries = choose_queries(corpus, settings.motion) if flow else np.zeros((len(corpus.demos), 0), int)
         self._weight = _label_weight(corpus, settings.motion) if flow else np.zeros((len(corpus.state), 0), np.float32)
@@ -145,18 +147,21 @@ class Gatherer:
         flow, flow_weight = self._flow(windows.demo, row, last, demonstrated, query)
         queries = np.take_along_axis(corpus.queries, self._queries[:, query, None], 1)[windows.demo]
         action, pose = corpus.action[row], corpus.object_pose[row]
-        if rng is not None and s.batch.shift_m:
-            shift = rng.uniform(-s.batch.shift_m, s.batch.shift_m, (windows.run.max() + 1, 3)).astype(np.float32)
-            shift[:, 2] = 0
-            of_frame, of_window = shift[run_of_frame], shift[windows.run]
-            points = points + of_frame[:, None]
-            queries = queries + of_window[:, None]
+        if rng is not None and (s.batch.shift_m or s.batch.turn_deg):
+            turn = s.batch.turn_deg if self._layout.turns(state.shape[1], action.shape[-1]) else 0.0
+            moves = Moves.draw(rng, int(windows.run.max()) + 1, s.batch.shift_m, turn, self._centre)
+            points, queries = moves.places(points, run_of_frame), moves.places(queries, windows.run)
+            flow = moves.directions(flow, windows.run)
             for place in self._layout.state_places:
-                state[:, place] += of_frame
-            if self._layout.action_place is not None:
-                action[..., self._layout.action_place] += of_window[:, None]
+                state[:, place] = moves.places(state[:, place], run_of_frame)
+            if (target := self._layout.action_place) is not None:
+                action[..., target] = moves.places(action[..., target], windows.run)
+            if (along := self._layout.action_displacement) is not None:
+                action[..., along] = moves.directions(action[..., along], windows.run)
             if pose.shape[-1]:
-                pose[..., :3] += of_window[:, None]
+                pose[..., :3] = moves.places(pose[..., :3], windows.run)
+                axes = pose[..., 3:].reshape(*pose.shape[:-1], 2, 3)
+                pose[..., 3:] = moves.directions(axes, windows.run).reshape(*pose.shape[:-1], 6)
         return Batch(
             **_tensors(
                 points=points,

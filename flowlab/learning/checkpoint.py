@@ -84,14 +84,15 @@ def load_policy(path: Path, device: str = "cpu") -> Loaded:
     Raises :class:`DataError` where there is none, or it is damaged.
     """
     weights = path if path.suffix == ".safetensors" else _newest(path)
-    trained = read_trained(weights.parents[1])
-    tensors, about = _read(weights)
+    folder = weights.absolute().parents[1]
+    trained = read_trained(folder)
+    tensors, step = _read(weights, "delete it to use the checkpoint before it")
     policy = Policy(trained.policy).requires_grad_(False).eval()
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:
-        raise DataError(f"{weights}: does not fit {weights.parents[1] / POLICY}; restore both from one run") from error
-    return Loaded(policy.to(device), trained, int(about["step"]), weights)
+        raise DataError(f"{weights}: does not fit {folder / POLICY}; restore both from one run") from error
+    return Loaded(policy.to(device), trained, step, weights)
 
 
 def read_trained(folder: Path) -> Trained:
@@ -143,15 +144,13 @@ def read_resume(folder: Path) -> tuple[int, dict[str, dict[str, Tensor]]]:
     """The step, and the groups of :func:`keep_resume`."""
     path = folder / RESUME
     if not path.exists():
-        raise DataError(
-            f"{folder}: nothing to resume (it has no {RESUME}); the run had not got that far, so start anew"
-        )
-    tensors, about = _read(path)
+        raise DataError(f"{folder}: nothing to resume (it has no {RESUME}); delete it and start anew")
+    tensors, step = _read(path, f"start anew; --from {folder} begins with its newest weights")
     groups: dict[str, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         group, _, rest = name.partition(":")
         groups.setdefault(group, {})[rest] = value
-    return int(about["step"]), groups
+    return step, groups
 
 
 @contextmanager
@@ -197,15 +196,18 @@ def _write(path: Path, tensors: Mapping[str, Tensor], about: dict[str, str]) -> 
         temporary.unlink(missing_ok=True)
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+def _read(path: Path, advice: str) -> tuple[dict[str, Tensor], int]:
+    """Tensors, and the step they are of."""
     if not path.exists():
         raise DataError(f"{path}: there is no such checkpoint")
     try:
         with safetensors.safe_open(path, "pt") as file:
             about = file.metadata() or {}
-        return load_file(path), about
+        return load_file(path), int(about["step"])
+    except KeyError as error:
+        raise DataError(f"{path}: not written by flowlab (it does not tell its step); {advice}") from error
     except (OSError, safetensors.SafetensorError) as error:
-        raise DataError(f"{path}: damaged ({error}); delete it to use the checkpoint before it") from error
+        raise DataError(f"{path}: damaged ({error}); {advice}") from error
 
 
 def _validated(model: type[Model], path: Path) -> Model:

@@ -89,8 +89,12 @@ def load_corpus(source: Source, fallback: Path) -> Corpus:
             temporary = temporary_path(folder)
             try:
                 _decode(source, temporary)
-                shutil.rmtree(folder, ignore_errors=True)
+                for outdated in folder.parent.glob("*"):
+                    if outdated != temporary:
+                        shutil.rmtree(outdated, ignore_errors=True)
                 os.replace(temporary, folder)
+            except OSError as error:
+                raise DataError(f"{folder}: cannot be written ({error.strerror}); make room there") from error
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
     return _open(folder)
@@ -121,8 +125,7 @@ def _decode(source: Source, folder: Path) -> None:
         demo = Demo(episode.task, episode.seed, row, row + len(episode))
         for name, values in _per_frame(episode).items():
             if name not in arrays:
-                shape = (source.frames, *values.shape[1:])
-                arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", "w+", values.dtype, shape)
+                arrays[name] = _create(folder / f"{name}.npy", values.dtype, (source.frames, *values.shape[1:]))
             if values.shape[1:] != arrays[name].shape[1:]:
                 raise DataError(
                     f"{source.path}: {demo.task} seed {demo.seed}: '{name}' is {values.shape[1:]} wide, in those "
@@ -139,6 +142,14 @@ def _decode(source: Source, folder: Path) -> None:
         array.flush()  # type: ignore[attr-defined]
     names = [*arrays, *queries[0]]
     write_json(folder / _DONE, {"demos": [asdict(demos[k]) for k in order], "arrays": names})
+
+
+def _create(path: Path, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    """A mapped array whose space on disk is taken: without that a full disk kills the process as it writes."""
+    array = np.lib.format.open_memmap(path, "w+", dtype, shape)
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+    return array
 
 
 def _per_frame(e: Episode) -> Mapping[str, np.ndarray]:

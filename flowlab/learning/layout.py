@@ -1,4 +1,4 @@
-"""Which numbers of state and action are places in the world, so that they can be shifted and given relatively."""
+"""Which numbers of state and action are places in the world, so that scenes can be moved and given relatively."""
 
 import numpy as np
 
@@ -21,6 +21,16 @@ class Layout(Settings):
     """Of the state: every place, the gripper's too."""
     action_place: tuple[int, int, int] | None = None
     """Of the action: where the gripper is sent to; None where actions are displacements or not known."""
+    action_displacement: tuple[int, int, int] | None = None
+    """Of the action: how far the gripper is to move along the world's axes; None where that is not known."""
+
+    def turns(self, state_width: int, action_width: int) -> bool:
+        """Whether all that has a direction is known, so that a scene can be turned: no quaternions, say.
+
+        Beside its triple, an action may have one number, the gripper's opening.
+        """
+        known = (self.action_place is not None or self.action_displacement is not None) and action_width <= 4
+        return known and self.gripper is not None and state_width == 3 * len(self.state_places)
 
 
 def find_layout(source: Source, corpus: Corpus) -> Layout:
@@ -32,7 +42,8 @@ def find_layout(source: Source, corpus: Corpus) -> Layout:
     if "expert" in source.settings:
         if source.settings["expert"]["scene"]["convention"] == "dp3":
             return Layout()
-        return Layout(gripper=first, state_places=(first, (3, 4, 5), (6, 7, 8)))
+        fingers = (3, 4, 5), (6, 7, 8)
+        return Layout(gripper=first, state_places=(first, *fingers), action_displacement=first)
     if not source.settings or corpus.state.shape[1] < 3 or not _gripper_is_seen(corpus):
         return Layout()
     places = corpus.action.shape[1] >= 3 and _actions_are_places(corpus)

@@ -49,6 +49,15 @@ class Means:
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + value
 
+    def state(self) -> dict[str, float]:
+        """What :meth:`load` takes up; empty where nothing was added."""
+        return {"count": self._count, **self._sums} if self._count else {}
+
+    def load(self, state: Mapping[str, float]) -> None:
+        """Go on from what :meth:`state` gave."""
+        self._sums = {name: value for name, value in state.items() if name != "count"}
+        self._count = int(state.get("count", 0))
+
     def take(self) -> dict[str, float]:
         """The means since the last call."""
         means = {name: total / max(self._count, 1) for name, total in self._sums.items()}

@@ -44,9 +44,11 @@ class Motion(nn.Module):
         ``condition`` (W, D) is the observation, ``places`` (W, M, ...) what is known of where the queries are, and
         ``windows`` the size of the whole batch, of which this process may have a part.
         """
-        step = draws.steps(self.diffusion.train_steps, windows)
-        noise = draws.normal(windows, *truth.shape[1:])
         mode = self.settings.condition
+        step = draws.steps(self.diffusion.train_steps, windows)
+        if mode == "one-step":
+            step = torch.full_like(step, self.diffusion.train_steps - 1)
+        noise = draws.normal(windows, *truth.shape[1:])
         known = self.place_terms(places, condition)
         denoised = self.denoise(
             self.diffusion.noised(truth, noise, step), known, self.terms(condition, known, step[:, None])
@@ -54,14 +56,11 @@ class Motion(nn.Module):
         loss = (self.distance(denoised, truth, reduction="none") * weight).mean()
         if mode == "auxiliary":
             return Learnt(loss, None)
-        if mode == "clean":
+        if mode in ("clean", "one-step"):
             seen = denoised.detach()
-        elif mode == "one-step":
-            with torch.no_grad():
-                seen = self._at_once(draws.normal(windows, *truth.shape[1:]), condition, known)
         else:
             seen = truth
-            if mode == "true-noised":
+            if mode == "truth-noised":
                 seen = truth + self.settings.condition_noise * draws.normal(windows, *truth.shape[1:])
         return Learnt(loss, self.summarise(seen.clamp(-self.clip, self.clip), known))
 

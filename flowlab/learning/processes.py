@@ -2,7 +2,10 @@
 
 import ctypes
 import os
+import warnings
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
+from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
@@ -22,8 +25,12 @@ class Processes:
         self.rank, self.count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise UsageError(f"--device {device}: PyTorch sees no GPU here; use --device cpu")
+        kind, _, number = device.partition(":")
+        if kind not in ("cpu", "cuda") or not (number or "0").isdecimal():
+            raise UsageError(f"--device {device}: there is no such device; use cpu, cuda or cuda:1")
+        if kind == "cuda" and int(number or "0") >= torch.cuda.device_count():
+            found = "no such GPU" if torch.cuda.is_available() else "no GPU"
+            raise UsageError(f"--device {device}: PyTorch sees {found} here; use --device cpu")
         if device == "cuda":
             device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
         self.device = torch.device(device)
@@ -61,7 +68,9 @@ class Processes:
         if self.count == 1:
             return policy
         ids = [self.device.index] if self.device.type == "cuda" else None
-        return DistributedDataParallel(policy, device_ids=ids, broadcast_buffers=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # from PyTorch 2.13 on, it is called forward_sync_buffers
+            return DistributedDataParallel(policy, device_ids=ids, broadcast_buffers=False)
 
     def autocast(self) -> AbstractContextManager[object]:
         """In which the losses are computed: matrix products in the precision asked for."""
@@ -105,7 +114,8 @@ def has_bf16(device: torch.device) -> bool:
     """Whether a device multiplies matrices faster in bf16: two to four times, where it can at all."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    return "avx512_bf16" in torch.cpu.get_capabilities() and torch.cpu.get_capabilities()["avx512_bf16"] is True
+    tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch has none
+    return bool(tell().get("avx512_bf16"))
 
 
 def _keep_freed_memory() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from flowlab.config import Settings
-from flowlab.errors import DataError, UsageError
+from flowlab.errors import DataError, UsageError, unknown
 from flowlab.learning.checkpoint import (
     Run,
     Trained,
@@ -19,11 +19,12 @@ from flowlab.learning.checkpoint import (
     read_resume,
     read_run,
     read_trained,
+    room_to_write,
     start_folder,
 )
 from flowlab.learning.corpus import Corpus, load_corpus
 from flowlab.learning.layout import find_layout
-from flowlab.learning.logs import make_log
+from flowlab.learning.logs import LOGS, make_log
 from flowlab.learning.metrics import Metrics
 from flowlab.learning.normaliser import fit
 from flowlab.learning.policy import Policy, PolicySpec
@@ -63,6 +64,9 @@ def prepare(
     Raises :class:`DataError` or :class:`UsageError` where settings, data or weights do not fit each other; then
     nothing is written but the decoded corpus.
     """
+    for name in machine.logs:
+        if name not in LOGS:
+            raise unknown("log", name, LOGS)
     processes = Processes(machine.device, machine.threads, machine.precision)
     processes.part(settings.batch.windows)
     source = open_source(data)
@@ -88,6 +92,7 @@ def prepare(
     trainer = Trainer(out, planned, policy, corpus, processes)
     if processes.is_first:
         start_folder(out, Trained.now(policy.spec, source), planned)
+        trainer.keep()
     processes.wait()
     return trainer
 
@@ -118,7 +123,8 @@ def run(trainer: Trainer, report: Callable[[Progress], None], should_stop: Calla
     first = trainer.processes.is_first
     name, settings = trainer.folder.name, trainer.settings.model_dump(mode="json")
     logs = [make_log(log, trainer.folder, name, settings) for log in trainer.run.logs] if first else []
-    metrics = Metrics(trainer.folder, trainer.step, logs) if first else None
+    with room_to_write(trainer.folder):
+        metrics = Metrics(trainer.folder, trainer.step, logs) if first else None
     try:
         return trainer.fit(metrics, report if first else _silent, should_stop)
     finally:

@@ -1,7 +1,7 @@
 """Every setting of a training run. The profiles in ``pipelines/train/`` give all of them a value."""
 
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, model_validator
@@ -10,6 +10,7 @@ from flowlab.config import Settings, explain, override, read_named
 from flowlab.errors import UsageError, unknown
 
 POLICIES = {"fdp": "3D Flow Diffusion Policy", "dp3": "3D Diffusion Policy", "mba": "Motion Before Action"}
+_Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class EncoderSettings(Settings):
@@ -23,11 +24,11 @@ class EncoderSettings(Settings):
     """Fourier features of the coordinates: sine and cosine of so many octaves."""
     relative: bool
     """Give points relative to the gripper, where the data tell where it is."""
-    widths: tuple[PositiveInt, ...]
+    widths: tuple[PositiveInt, ...] = Field(min_length=1)
     """Layers of the PointNet, each followed by LayerNorm and ReLU, before its max-pool."""
     features: PositiveInt
     """Length of a cloud's vector."""
-    state_widths: tuple[PositiveInt, ...]
+    state_widths: tuple[PositiveInt, ...] = Field(min_length=1)
     """Layers for the robot's state; the last is the length of its vector."""
 
 
@@ -36,9 +37,9 @@ class DenoiserSettings(Settings):
 
     kind: Literal["unet", "mlp"]
     """``unet``: 1D convolutions over time, DP3's. ``mlp``: residual layers over the whole horizon at once."""
-    widths: tuple[PositiveInt, ...]
+    widths: tuple[PositiveInt, ...] = Field(min_length=1)
     """Channels of each level, or of each residual layer (all alike)."""
-    step_embedding: PositiveInt
+    step_embedding: int = Field(ge=4, multiple_of=2)
     """Length of the diffusion step's embedding."""
 
     @model_validator(mode="after")
@@ -66,12 +67,13 @@ class MotionSettings(Settings):
     """Weight in the loss of a point that the camera does not see; one that it sees exactly has 1."""
     sigma_m: PositiveFloat
     """Stated error [m] at which the weight of an estimated position is a half."""
-    condition: Literal["clean", "one-step", "true", "true-noised", "auxiliary"]
+    condition: Literal["clean", "one-step", "truth", "truth-noised", "auxiliary"]
     """What the action is conditioned on in training. ``clean``: what the network makes of the noised motion, without
-    gradient. ``one-step``: what it makes of pure noise, in use too. ``true``: the demonstrated motion;
-    ``true-noised``: the same with noise. ``auxiliary``: nothing, the motion is only an additional loss."""
+    gradient. ``one-step``: what it makes of pure noise, in use too; then it learns that step alone. ``truth``: the
+    demonstrated motion; ``truth-noised``: the same with noise. ``auxiliary``: nothing, the motion is only an additional
+    loss."""
     condition_noise: float = Field(ge=0)
-    """Deviation of the noise of ``true-noised``, in normalised units."""
+    """Deviation of the noise of ``truth-noised``, in normalised units."""
     scale: Literal["limits", "quantile"]
     """What is 1 when flow is normalised (0 is always no motion): its largest component, or the length that 99 % of the
     steps stay below; the rest is clipped at ``clip``."""
@@ -109,6 +111,9 @@ class BatchSettings(Settings):
     """Noise draws per window for the action: an observation is encoded once for all of them."""
     shift_m: float = Field(ge=0)
     """Shift scene and robot together by up to so much along x and y, at random [m]."""
+    turn_deg: float = Field(ge=0, le=180)
+    """Turn scene and robot together about the vertical by up to so much, at random [degrees]: only where all of the
+    state is places and the action is a place or a displacement, as in simulation."""
     pad: bool
     """Train on the steps before the start and after the end of a demonstration too, which repeat its first and last
     action, as DP3 does; else they have no weight."""
@@ -124,7 +129,7 @@ class OptimiserSettings(Settings):
     """AdamW for each module, cosine decay after a linear warm-up, moving average of the weights."""
 
     learning_rate: PositiveFloat
-    betas: tuple[float, float]
+    betas: tuple[_Share, _Share]
     weight_decay: float = Field(ge=0)
     warmup_steps: int = Field(ge=0)
     """At most a tenth of the run."""
@@ -149,13 +154,13 @@ class RunSettings(Settings):
     epochs: PositiveInt
     """Each demonstrated window once an epoch; ``steps`` or ``minutes`` override it."""
     steps: PositiveInt | None
-    minutes: PositiveFloat | None
+    minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
     """As many steps as fit: they are timed first. CPU time of one thread; on a GPU, by the clock."""
     validations: int = Field(ge=0)
     """Evenly spaced looks at held-out demonstrations."""
     checkpoints: PositiveInt
     """Evenly spaced checkpoints of the weights; the last can be resumed."""
-    seed: int = Field(ge=0)
+    seed: int = Field(ge=0, lt=2**63)
 
 
 class TrainSettings(Settings):
@@ -184,6 +189,11 @@ class TrainSettings(Settings):
         for denoiser in (self.action, self.motion.denoiser):
             if denoiser.kind == "unet" and self.horizon % 2 ** (len(denoiser.widths) - 1):
                 raise ValueError(f"a U-Net of {len(denoiser.widths)} levels cannot halve {self.horizon} steps so often")
+        if self.policy == "fdp" and self.motion.layout == "per-query" and len(set(self.motion.denoiser.widths)) != 1:
+            raise ValueError(
+                "the layers of a per-query network are all alike, as in motion.denoiser.widths=[128, 128, 128]; found "
+                f"{list(self.motion.denoiser.widths)}"
+            )
         return self
 
 
@@ -207,4 +217,7 @@ def load_settings(profile: str, policy: str, overrides: Iterable[str] = ()) -> T
     try:
         return TrainSettings.model_validate(values)
     except ValidationError as error:
-        raise UsageError(f"{origin}: {explain(error, TrainSettings)}") from error
+        first = error.errors()[0]
+        of_all = not first["loc"]  # several groups do not fit each other: to show all settings would not help
+        reason = first["msg"].removeprefix("Value error, ") if of_all else explain(error, TrainSettings)
+        raise UsageError(f"{origin}: {reason}") from error

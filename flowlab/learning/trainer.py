@@ -55,6 +55,7 @@ class Trainer:
         windows = all_windows(corpus, list(run.train), settings.executed)
         self._sampler = Sampler(windows, settings.batch.windows, settings.batch.segment, settings.run.seed)
         self._looked_at = all_windows(corpus, list(run.held_out), settings.executed) if run.held_out else None
+        self._means = Means()
         self.step = 0
 
     def train_step(self) -> dict[str, float]:
@@ -75,10 +76,7 @@ class Trainer:
             values["motion_loss"] = losses.motion
         numbers = self.processes.mean({k: v.detach() for k, v in values.items()})
         if not all(np.isfinite(v) for v in numbers.values()):
-            raise Diverged(
-                f"{self.folder}: the loss is {numbers['loss']} at step {self.step}; the last checkpoint is whole. "
-                "Lower optimiser.learning_rate and start anew, or look at the data with 'flowlab validate'"
-            )
+            raise self._diverged(f"the loss is {numbers['loss']}")
         losses.total.backward()
         self.optimisers.update(self.step)
         self.average.update(self.policy, self.step)
@@ -94,14 +92,14 @@ class Trainer:
         """Train to the end of the run; False where ``should_stop`` ended it earlier, to be resumed."""
         looks = _evenly(self.run.steps, self.settings.run.validations) if self._looked_at is not None else set()
         keeps = _evenly(self.run.steps, self.settings.run.checkpoints)
-        means, last = Means(), None
+        last = None
         began, last_save, done_before = time.monotonic(), time.monotonic(), self.step
         while self.step < self.run.steps:
-            means.add(self.train_step())
+            self._means.add(self.train_step())
             at_line = self.step % _STEPS_PER_LINE == 0 or self.step == self.run.steps
             if at_line:
                 rate = (self.step - done_before) * self.settings.batch.windows / (time.monotonic() - began)
-                averages = means.take()
+                averages = self._means.take()
                 learning_rate = self.optimisers.learning_rate(self.step - 1)
                 self._note(metrics, "train", averages | {"lr": learning_rate, "samples_per_s": rate})
             if self.step in looks:
@@ -111,9 +109,9 @@ class Trainer:
                 report(Progress(self.step, self.run.steps, rate, averages["loss"], last))
             stop = self.processes.agree(should_stop())
             if self.step in keeps:
-                self._keep(self.step)
+                self.keep(self.step)
             if stop or self.processes.agree(at_line and time.monotonic() - last_save > _SECONDS_BETWEEN_SAVES):
-                self._keep(None)
+                self.keep()
                 last_save = time.monotonic()
             if stop and self.step < self.run.steps:
                 return False
@@ -129,8 +127,13 @@ class Trainer:
             with room_to_write(self.folder):
                 metrics.write(kind, self.step, values)
 
-    def _keep(self, checkpoint: int | None) -> None:
-        """Keep what resuming needs, and the weights as a checkpoint."""
+    def keep(self, checkpoint: int | None = None) -> None:
+        """Keep what resuming needs, and the weights as a checkpoint.
+
+        Raises :class:`Diverged` where weights are not finite, before anything is written.
+        """
+        if not all(bool(p.isfinite().all()) for p in self.policy.parameters()):
+            raise self._diverged("a weight is no longer finite")
         if not self.processes.is_first:
             return
         if checkpoint is not None:
@@ -139,6 +142,7 @@ class Trainer:
             "policy": self.policy.state_dict(),
             "average": self.average.policy.state_dict(),
             "optimiser": self.optimisers.state(),
+            "means": {k: torch.tensor(v, dtype=torch.float64) for k, v in self._means.state().items()},
         }
         keep_resume(self.folder, self.step, groups)
 
@@ -147,10 +151,18 @@ class Trainer:
         try:
             self.policy.load_state_dict(groups["policy"])
             self.average.policy.load_state_dict(groups["average"])
-            self.optimisers.load(groups["optimiser"])
+            if step:
+                self.optimisers.load(groups["optimiser"])
         except (KeyError, RuntimeError) as error:
             raise DataError(f"{self.folder}: its resume file does not fit its policy.json; start anew") from error
+        self._means.load({name: float(value) for name, value in groups.get("means", {}).items()})
         self.step = step
+
+    def _diverged(self, what: str) -> Diverged:
+        return Diverged(
+            f"{self.folder}: {what} at step {self.step}; the last checkpoint is whole. Lower optimiser.learning_rate "
+            "and start anew, or look at the data with 'flowlab validate'"
+        )
 
 
 def _evenly(steps: int, times: int) -> set[int]:

@@ -16,14 +16,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from flowlab.errors import DataError
 from flowlab.storage.files import temporary_path
 
-LOSSES = {"loss": "loss", "action_loss": "of action", "motion_loss": "of motion"}
+LOSSES = {"loss": "total", "action_loss": "action", "motion_loss": "motion"}
 """What training lines say, and how it is labelled."""
-BASELINES = {
-    "zero": "stands still",
-    "hold": "repeats the last",
-    "constant": "keeps its velocity",
-}
-"""What needs no training, by the suffix of its error's name in validation lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +28,23 @@ class Panel:
     """Of validation lines; its baselines have suffixes."""
     heading: str
     unit: str
+    baselines: Mapping[str, str]
+    """What needs no training, by suffix, and how it is labelled."""
 
 
+_OF_ACTION = {"zero": "no action", "hold": "last action again"}
+_OF_MOTION = {"zero": "no motion", "constant": "same velocity"}
 COLUMNS = (
-    (Panel("action_l1", "held-out actions", "mean absolute error"),),
+    (Panel("action_l1", "held-out actions", "mean error [unit of the data]", _OF_ACTION),),
     (
-        Panel("flow_moving_mm", "held-out flow, moving points", "distance [mm]"),
-        Panel("flow_static_mm", "held-out flow, still points", "distance [mm]"),
+        Panel("flow_moving_mm", "held-out flow, moving points", "mean error [mm]", _OF_MOTION),
+        Panel("flow_static_mm", "held-out flow, still points", "mean error [mm]", _OF_MOTION),
     ),
-    (Panel("pose_mm", "held-out object position", "distance [mm]"),),
+    (Panel("pose_mm", "held-out positions of the object", "mean error [mm]", _OF_MOTION),),
 )
 """Columns of panels, beside that of training."""
+FAR = 2.0
+"""A baseline more than so many times as high as the rest is not drawn: its label alone says how bad it is."""
 
 _COLOURS = ("#2a6fbb", "#e07b1a", "#2f9e6e")
 _POLICY, _BASELINES = "#2a6fbb", {"zero": "#6d737c", "hold": "#b8438a", "constant": "#7b5bb8"}
@@ -61,6 +61,16 @@ class Line:
     kind: str
     step: int
     values: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """What stands right of a panel, where a line ends."""
+
+    height: float
+    """On the panel's axis."""
+    text: str
+    colour: str
 
 
 Series = tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]
@@ -150,7 +160,8 @@ def _about(lines: Sequence[Line]) -> str:
     facts = [f"{max(line.step for line in lines):,} steps".replace(",", " ")]
     for name, what in (("cpu_s", "of CPU time"), ("wall_s", "by the clock")):
         if name in last:
-            facts.append(f"{last[name] / 60:.1f} min {what}")
+            minutes = last[name] / 60
+            facts.append(f"{minutes:.1f} min {what}" if minutes >= 2 else f"{last[name]:.0f} s {what}")
     _, rates = _series(lines, "samples_per_s")
     if len(rates):
         facts.append(f"{np.median(rates):,.0f} samples/s".replace(",", " "))
@@ -175,8 +186,8 @@ def _draw_losses(axes: Axes, training: Sequence[Line]) -> None:
     ends = []
     for name, colour in zip(told, _COLOURS, strict=False):
         steps, values = _series(training, name)
-        axes.plot(steps, values, color=colour, linewidth=1.4, zorder=3)
-        ends.append((values[-1], f"{LOSSES[name]} {values[-1]:.3g}", colour))
+        _plot(axes, steps, values, colour)
+        ends.append(End(values[-1], f"{LOSSES[name]} {values[-1]:.3g}", colour))
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
@@ -187,30 +198,36 @@ def _draw_losses(axes: Axes, training: Sequence[Line]) -> None:
 
 def _draw_rate(axes: Axes, training: Sequence[Line]) -> None:
     steps, values = _series(training, "lr")
-    axes.plot(steps, values, color=_QUIET, linewidth=1.4, zorder=3)
-    axes.set_ylim(bottom=0)
-    axes.yaxis.set_major_locator(MaxNLocator(2))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    _plot(axes, steps, values, _QUIET)
+    highest = float(values.max(initial=0))
+    axes.set_ylim(0, 1.1 * highest or 1)
+    axes.set_yticks([0, highest], ["0", f"{highest:.3g}"])
     _dress(axes, "learning rate", "")
 
 
+def _plot(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> None:
+    """A line of training; a single point has no line to be seen by."""
+    axes.plot(steps, values, color=colour, linewidth=1.4, marker="o" if len(steps) == 1 else "", zorder=3)
+
+
 def _draw_errors(axes: Axes, panel: Panel, validation: Sequence[Line]) -> None:
-    """The policy's error at every look, and dashed what its baselines have. A baseline that is much worse than
-    everything else would flatten the rest: its label alone says how bad it is."""
+    """The policy's error at every look, and dashed what its baselines have."""
     steps, values = _series(validation, panel.key)
-    found = {s: _series(validation, f"{panel.key}_{s}")[1] for s in BASELINES}
-    baselines = {s: float(v[-1]) for s, v in found.items() if len(v)}
-    top = 1.15 * max([*values, *sorted(baselines.values())[:1]])
-    axes.plot(steps, values, color=_POLICY, linewidth=1.8, marker="o", markersize=3.5, zorder=4)
-    ends = [(float(values[-1]), f"policy {values[-1]:.3g}", _POLICY)]
+    found = {s: _series(validation, f"{panel.key}_{s}")[1] for s in panel.baselines}
+    baselines = {suffix: float(v[-1]) for suffix, v in found.items() if len(v)}
+    rest = max([*values, *sorted(baselines.values())[:1]])
+    top = 1.1 * max([rest, *(v for v in baselines.values() if v <= FAR * rest)]) or 1.0
+    axes.plot(steps, values, color=_POLICY, linewidth=1.8, marker="o", markersize=3.5, zorder=4, clip_on=False)
+    ends = [End(values[-1], f"policy {values[-1]:.3g}", _POLICY)]
     for suffix, value in baselines.items():
-        drawn = value <= top
-        if drawn:
-            axes.axhline(value, color=_BASELINES[suffix], linewidth=1.2, linestyle=(0, (4, 3)), zorder=2)
-        text = f"{'' if drawn else '↑ '}{BASELINES[suffix]} {value:.3g}"
-        ends.append((min(value, top), text, _BASELINES[suffix]))
+        text, colour = f"{panel.baselines[suffix]} {value:.3g}", _BASELINES[suffix]
+        if value > FAR * rest:
+            ends.append(End(top, f"{text} ↑", colour))
+            continue
+        axes.axhline(value, color=colour, linewidth=1.2, linestyle=(0, (4, 3)), zorder=2)
+        ends.append(End(value, text, colour))
     axes.set_ylim(0, top)
-    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     _dress(axes, panel.heading, panel.unit)
     _label_ends(axes, ends)
 
@@ -226,16 +243,16 @@ def _draw_steps(axes: Axes, last_step: int) -> None:
         axes.set_xlabel("training step", color=_QUIET, fontsize=9)
 
 
-def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
-    """Name lines right of the panel, each at its last value, or as near as the others allow."""
-    panel = axes.get_window_extent()
-    gap = 1.25 * _LABEL_PT * _DPI / 72 / panel.height
-    ordered = sorted(ends, key=lambda end: end[0])
-    wanted = [axes.transAxes.inverted().transform(axes.transData.transform((0, y)))[1] for y, _, _ in ordered]
-    for place, (_, text, colour) in zip(_spread(wanted, gap), ordered, strict=True):
+def _label_ends(axes: Axes, ends: Sequence[End]) -> None:
+    """Name lines right of the panel, each where it ends, or as near as the others allow."""
+    gap = 1.3 * _LABEL_PT * _DPI / 72 / axes.get_window_extent().height
+    ordered = sorted(ends, key=lambda end: end.height)
+    to_share = axes.transData + axes.transAxes.inverted()
+    wanted = [float(to_share.transform((0, end.height))[1]) for end in ordered]
+    for place, end in zip(_spread(wanted, gap), ordered, strict=True):
         axes.text(
-            1.03, place, text, transform=axes.transAxes, fontsize=_LABEL_PT, color=colour, va="center",
-            clip_on=False,
+            1.03, place, end.text, transform=axes.transAxes, fontsize=_LABEL_PT, color=end.colour,
+            va="center_baseline",
         )  # fmt: skip
 
 
