@@ -89,10 +89,12 @@ def timings(data: Path, repeats: int, folder: Path) -> dict[str, Any]:
     }
     plans = {name: planning(t) for name, t in trainers.items()}
     steps: dict[str, Callable[[], object]] = {name: t.train_step for name, t in trainers.items()}
+    reference_step, reference_plan = reference()
     if has_bf16(torch.device("cpu")):
+        steps["reference, bf16"] = torch.autocast("cpu", torch.bfloat16)(reference_step)
+        steps["same maths, bf16"] = trainer_of(data, folder, "paper", "dp3", "bf16", SAME_MATHS).train_step
         for policy in ("dp3", "fdp"):
             steps[f"{policy} fast, bf16"] = trainer_of(data, folder, "fast", policy, "bf16").train_step
-    reference_step, reference_plan = reference()
     figures = {
         "training step": interleaved({"reference": reference_step, **steps}, repeats),
         "plan": interleaved({"reference": reference_plan, **plans}, 2 * repeats),

@@ -15,6 +15,8 @@ with tempfile.TemporaryDirectory() as folder:
     flowlab("extract-sim", "drawer-open", "--episodes", "1", "--out", data, "--recipe", "metaworld")
     flowlab("validate", data)
     flowlab("viz", data, "--png", f"{folder}/still.png", "--save", f"{folder}/episode.rrd")
+    flowlab("train", data, "--policy", "fdp", "--out", f"{folder}/run", "--set", "run.steps=2")
+    assert len(list(Path(f"{folder}/run/checkpoints").iterdir())) > 0
     assert Path(f"{folder}/still.png").stat().st_size > 10_000
     assert Path(f"{folder}/episode.rrd").stat().st_size > 10_000
 print("the installed wheel works")

@@ -114,11 +114,11 @@ def test_a_baseline_far_above_the_rest_is_only_named(tmp_path: Path) -> None:
     assert actions.get_ylim() == pytest.approx((0, 1.1 * 0.39))
 
 
-@pytest.mark.parametrize("still", [0.0, 0.001, 2.9])
-def test_labels_stay_apart_and_inside(tmp_path: Path, still: float) -> None:
-    panels = draw(
-        tmp_path, make_lines(ACTION | FLOW | {"flow_static_mm_zero": still, "flow_static_mm_constant": still})
-    )
+def test_labels_stay_apart_and_inside(tmp_path: Path) -> None:
+    """Three crowd at the top of one panel, two at the bottom of the other."""
+    top = {"flow_moving_mm": 18.0, "flow_moving_mm_zero": 100.0, "flow_moving_mm_constant": 17.9}
+    bottom = {"flow_static_mm": 3.0, "flow_static_mm_zero": 0.0, "flow_static_mm_constant": 0.001}
+    panels = draw(tmp_path, make_lines(ACTION | top | bottom, steps=500))
     for axes in panels.values():
         figure = axes.figure
         assert isinstance(figure, Figure)

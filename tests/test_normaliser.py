@@ -49,6 +49,21 @@ def test_limits_of_state_and_action_become_one(tmp_path: Path) -> None:
         np.testing.assert_allclose(values.max(0), 1, atol=1e-6)
 
 
+def test_where_scenes_are_turned_displacements_are_alike_in_all_directions(tmp_path: Path) -> None:
+    def narrow(e: Episode) -> Episode:
+        return replace(e, action=e.action * np.array([0.9, 0.2, 0.5, 1], np.float32))
+
+    episodes = [narrow(make_episode(k)) for k in range(3)]
+    layout = Layout(gripper=FIRST, state_places=(FIRST,), action_displacement=FIRST)
+    source, corpus = open_both(tmp_path / "d", episodes)
+    plain, turned = (fit(source, corpus, layout, tiny_settings("fdp", f"batch.turn_deg={d}")).action for d in (0, 30))
+    largest = np.abs(all_of(episodes, "action")[:, :3]).max()
+    np.testing.assert_allclose(turned.unit[:3], largest)
+    assert turned.offset[:3] == (0, 0, 0)
+    assert (turned.unit[3], turned.offset[3]) == (plain.unit[3], plain.offset[3])
+    assert plain.unit[1] < 0.3
+
+
 def test_what_never_changes_is_centred_and_not_blown_up(tmp_path: Path) -> None:
     def still(e: Episode) -> Episode:
         action = e.action.copy()

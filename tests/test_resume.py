@@ -196,15 +196,18 @@ def test_a_finished_run_stays_as_it_is(rolls: Path, tmp_path: Path, capsys: Capt
 
 
 def test_the_same_seed_gives_the_same_weights(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
-    short = options("run.steps=8", "run.checkpoints=2")
+    short = (rolls, "--policy", "fdp", *SMALL, *options("run.steps=8", "run.checkpoints=2"))
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        train(capsys, rolls, "--policy", "fdp", "--out", tmp_path / name, *SMALL, *short, "--seed", str(seed))
+        train(capsys, *short, "--out", tmp_path / name, "--seed", str(seed))
     assert kept_by(tmp_path / "a") == kept_by(tmp_path / "b")
     assert without_times(lines_of(tmp_path / "a")) == without_times(lines_of(tmp_path / "b"))
-    one, other = weights_of(tmp_path / "a", 4), weights_of(tmp_path / "c", 4)
-    matrices = [name for name in one if one[name].ndim > 1]
-    assert matrices
-    assert all(not np.array_equal(one[name], other[name]) for name in matrices)
+    for name, seed in (("d", 5), ("e", 6)):  # what is drawn on the way differs too
+        train(capsys, *short, "--out", tmp_path / name, "--seed", str(seed), "--from", tmp_path / "a")
+    for one, other in ("ac", "de"):
+        mine, theirs = weights_of(tmp_path / one, 8), weights_of(tmp_path / other, 8)
+        matrices = [name for name in mine if mine[name].ndim > 1]
+        assert matrices
+        assert all(not np.array_equal(mine[name], theirs[name]) for name in matrices)
 
 
 def stopped(rolls: Path, run: Path) -> Path:

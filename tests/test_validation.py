@@ -94,6 +94,11 @@ def test_the_truth_has_no_error(name: str) -> None:
     assert min(found.values()) > 1e-3
 
 
+def test_with_one_frame_there_is_no_past_to_go_on_from() -> None:
+    found = errors(random_corpus(), oracle(tiny_settings("fdp", "history=1")))
+    assert found.keys() == {f"{kind}{x}" for kind in ("action_l1", "flow_moving_mm") for x in ("", "_zero")}
+
+
 def test_an_offset_of_actions_is_the_error_whatever_their_number() -> None:
     found = errors(rolling(), oracle(tiny_settings("dp3"), action_off=-0.25))
     assert found["action_l1"] == pytest.approx(0.25, rel=1e-5)

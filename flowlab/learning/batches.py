@@ -1,5 +1,6 @@
 """From demonstrations to batches: which windows a training step sees, and their tensors."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -16,6 +17,9 @@ from flowlab.learning.settings import MotionSettings, TrainSettings
 from flowlab.learning.variation import Moves
 from flowlab.perception.observer import pad
 from flowlab.records import Role
+
+_OBJECT_SHARE = 1 / 3
+"""Of stratified queries; the default of :class:`~flowlab.perception.queries.QuerySettings`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +87,8 @@ def all_windows(corpus: Corpus, demos: list[int], executed: int) -> Windows:
 class Sampler:
     """The windows of every training step, a function of (seed, step) alone.
 
-    Each epoch cuts all windows into runs, elsewhere than the epoch before, and deals the runs out in random order.
+    Each epoch cuts all windows into runs, from a random place on, and deals the runs out in random order; fewer than a
+    run's windows are left out.
     """
 
     def __init__(self, windows: Windows, size: int, segment: int, seed: int) -> None:
@@ -220,6 +225,11 @@ def choose_queries(corpus: Corpus, settings: MotionSettings) -> Int[np.ndarray, 
     return np.stack([_choose(corpus, k, settings) for k in range(len(corpus.demos))])
 
 
+def query_settings(settings: MotionSettings) -> dict[str, Any]:
+    """The same choice, for :class:`~flowlab.perception.queries.QuerySettings` to make on a new cloud."""
+    return {"points": settings.points, "sampling": settings.sampling, "object_share": _OBJECT_SHARE}
+
+
 def _choose(corpus: Corpus, demo: int, settings: MotionSettings) -> np.ndarray:
     count, wanted = int(corpus.query_count[demo, 0]), settings.points
     xyz, role = corpus.queries[demo, :count], corpus.query_role[demo, :count]
@@ -232,7 +242,9 @@ def _choose(corpus: Corpus, demo: int, settings: MotionSettings) -> np.ndarray:
             f"{where.task} seed {where.seed}: none of its {count} query points is known to lie on an object; use "
             "--set motion.sampling=scene, or make the dataset with --set queries.sampling=stratified"
         )
-    chosen = movable[farthest_points(xyz[movable], wanted if settings.sampling == "object" else -(-wanted // 3))]
+    chosen = movable[
+        farthest_points(xyz[movable], wanted if settings.sampling == "object" else math.ceil(wanted * _OBJECT_SHARE))
+    ]
     if settings.sampling == "stratified":
         chosen = np.concatenate([chosen, farthest_points(xyz, wanted - len(chosen), chosen)])
     return pad(chosen, wanted)

@@ -48,7 +48,7 @@ class Film(nn.Module):
 
 
 def modulate(x: Tensor, terms: Tensor) -> Tensor:
-    """Scale and shift (B, ..., C) by (B, 2 C)."""
+    """Scale (B, ..., C) by 1 + the first half of (B, 2 C), and shift it by the second; DP3 scales by the first half."""
     scale, shift = terms.view(len(x), *[1] * (x.ndim - 2), -1).chunk(2, -1)
     return torch.addcmul(x + shift, x, scale)
 

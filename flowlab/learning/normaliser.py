@@ -53,14 +53,27 @@ def fit(source: Source, corpus: Corpus, layout: Layout, settings: TrainSettings)
     action = arrays["action"]["min"], arrays["action"]["max"]
     if relative and layout.action_place is not None:
         action = _relative_limits(corpus, layout, settings)
+    scale = Scale.of_limits(*action)
+    if settings.batch.turn_deg and layout.action_displacement is not None:
+        scale = _alike_in_all_directions(scale, action, layout.action_displacement)
     flow_unit, flow_clip = _flow_scale(source.statistics, settings)
     return Normaliser(
         place=Scale(offset=(0.0,) * 3 if relative else tuple(centre.tolist()), unit=(half,) * 3),
         state=Scale.of_limits(arrays["state"]["min"], arrays["state"]["max"]),
-        action=Scale.of_limits(*action),
+        action=scale,
         flow=Scale(offset=(0.0,) * 3, unit=(flow_unit,) * 3),
         flow_clip=flow_clip,
     )
+
+
+def _alike_in_all_directions(
+    scale: Scale, limits: tuple[Sequence[float], Sequence[float]], channels: tuple[int, int, int]
+) -> Scale:
+    """A scale whose ``channels`` have one unit and no offset, so that a turned displacement is in range, too."""
+    offset, unit = np.array(scale.offset), np.array(scale.unit)
+    offset[list(channels)] = 0
+    unit[list(channels)] = max(np.abs(np.array(limits)[:, list(channels)]).max(), _STILL)
+    return Scale(offset=tuple(offset.tolist()), unit=tuple(unit.tolist()))
 
 
 def _flow_scale(statistics: Mapping[str, Any], settings: TrainSettings) -> tuple[float, float]:

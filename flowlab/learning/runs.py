@@ -11,6 +11,7 @@ import torch
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError, unknown
+from flowlab.learning.batches import query_settings
 from flowlab.learning.checkpoint import (
     Run,
     Trained,
@@ -153,7 +154,7 @@ def _make_policy(source: Source, corpus: Corpus, settings: TrainSettings, began_
         layout=layout,
         normaliser=fit(source, corpus, layout, settings),
         observer=source.observer,
-        queries={**source.queries, "points": settings.motion.points, "sampling": settings.motion.sampling},
+        queries={**source.queries, **query_settings(settings.motion)},
     )
     torch.manual_seed(settings.run.seed)
     if loaded is None:

@@ -186,7 +186,7 @@ class TrainSettings(Settings):
     def _fits(self) -> "TrainSettings":
         if self.history - 1 + self.executed > self.horizon:
             raise ValueError(f"{self.executed} steps from frame {self.history} on reach beyond {self.horizon}")
-        for denoiser in (self.action, self.motion.denoiser):
+        for denoiser in (self.action, *([self.motion.denoiser] if self.policy != "dp3" else [])):
             if denoiser.kind == "unet" and self.horizon % 2 ** (len(denoiser.widths) - 1):
                 raise ValueError(f"a U-Net of {len(denoiser.widths)} levels cannot halve {self.horizon} steps so often")
         if self.policy == "fdp" and self.motion.layout == "per-query" and len(set(self.motion.denoiser.widths)) != 1:

@@ -23,7 +23,7 @@ def validate(policy: Policy, gatherer: Gatherer, windows: Windows, device: torch
     those of no action, and of the last one repeated. ``flow_moving_mm`` and ``flow_static_mm``: mean distance [mm]
     between predicted and true positions of query points, over the steps from now on that the labels cover;
     ``pose_mm`` is that of the object's position. ``_zero`` stands still, ``_constant`` keeps the true velocity of the
-    last step.
+    last step. Policies that see one frame only have no last step to go by, so these two are left out.
     """
     generator = torch.Generator().manual_seed(0)
     sums: dict[str, np.ndarray] = {}
@@ -31,7 +31,12 @@ def validate(policy: Policy, gatherer: Gatherer, windows: Windows, device: torch
         batch = gatherer.gather(part).to(device)
         for name, (total, count) in _errors(policy, batch, policy.plan(batch, generator)).items():
             sums[name] = sums.get(name, np.zeros(2)) + np.array([float(total), float(count)])
-    return {name: float(total / count) for name, (total, count) in sums.items() if count}
+    baselines = ("_zero",) if policy.spec.settings.history == 1 else ("_zero", "_hold", "_constant")  # need a past
+    return {
+        name: float(total / count)
+        for name, (total, count) in sums.items()
+        if count and (name.endswith(baselines) or not name.endswith(("_hold", "_constant")))
+    }
 
 
 def _parts(windows: Windows) -> Iterator[Windows]:
