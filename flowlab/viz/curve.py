@@ -207,7 +207,8 @@ def _draw_rate(axes: Axes, training: Sequence[Line]) -> None:
 
 def _plot(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> None:
     """A line of training; a single point has no line to be seen by."""
-    axes.plot(steps, values, color=colour, linewidth=1.4, marker="o" if len(steps) == 1 else "", zorder=3)
+    marker = "o" if len(steps) == 1 else ""
+    axes.plot(steps, values, color=colour, linewidth=1.4, marker=marker, markersize=3.5, zorder=3, clip_on=False)
 
 
 def _draw_errors(axes: Axes, panel: Panel, validation: Sequence[Line]) -> None:
