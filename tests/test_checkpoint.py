@@ -135,7 +135,7 @@ def test_policy_json_tells_what_the_policy_is(run: Path, rolls: Path) -> None:
     policy = about["policy"]
     assert (policy["state_width"], policy["action_width"], policy["tasks"]) == (9, 4, ["roll"])
     assert policy["observer"] == SETTINGS["observer"]
-    assert policy["queries"] == {"points": 8, "sampling": "scene"}
+    assert policy["queries"] == {"points": 8, "sampling": "scene", "object_share": 1 / 3}
     settings = policy["settings"]
     assert (settings["policy"], settings["encoder"]["points"], settings["run"]["steps"]) == ("fdp", 64, 20)
     demos = [Dataset(rolls).episode(k) for k in range(4)]
