@@ -31,15 +31,12 @@ from flowlab.pipeline.engine import LocalEngine
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.run import extract
 from flowlab.sim.environment import SceneSettings
-from flowlab.sim.rollout import Studio
 
 WINDOWS, POINTS = 128, 512
 SAME_MATHS = (
     "action.widths=[128,256,384]", "encoder.points=512", "batch.segment=8", "diffusion.loss=mse", "batch.pad=true",
 )  # fmt: skip
 """The reference's architecture and loss, on top of the paper's profile: only how it is computed differs."""
-FIRST_NEW_SEED = 100_000
-"""Far from those of any demonstration."""
 
 
 def main() -> None:
@@ -167,9 +164,9 @@ def outcome(
     trainer = prepare(data, out, settings, Machine(device="cpu", precision="auto"))
     run(trainer, lambda _: None)
     spent = (time.process_time() - begin) / 60
-    studio = Studio(task, SceneSettings())
+    stage = Stage(task, SceneSettings())
     begin = time.process_time()
-    outcomes = [roll_out(studio, trainer.average.policy, FIRST_NEW_SEED + k) for k in range(episodes)]
+    outcomes = [a.outcome for a in roll_out(trainer.average.policy, stage, trials([task], [0], episodes))]
     each = (time.process_time() - begin) / episodes
     solved = sum(o.success for o in outcomes)
     print(

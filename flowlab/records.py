@@ -136,6 +136,16 @@ class Source(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Foreseen:
+    """Where a policy expected the query points of an episode to go, plan by plan."""
+
+    step: Int[np.ndarray, "P"]
+    """The step each plan was made at, in order."""
+    paths_world: Float32[np.ndarray, "P H M 3"]
+    """Row 0: where every query point truly was then [m]; row k: where it was expected after k more actions."""
+
+
+@dataclass(frozen=True, slots=True)
 class Quality:
     """What is known of the error of tracks that were estimated from pictures."""
 

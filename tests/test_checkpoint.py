@@ -35,7 +35,7 @@ from flowlab.learning import runs
 from flowlab.learning.batches import Batch, Gatherer, all_windows
 from flowlab.learning.checkpoint import load_policy
 from flowlab.learning.corpus import load_corpus
-from flowlab.learning.policy import Policy
+from flowlab.learning.policy import PolicyNetwork
 from flowlab.learning.settings import load_settings
 from flowlab.learning.source import open_source
 from flowlab.learning.trainer import Trainer
@@ -61,7 +61,7 @@ def prepare(data: Path, out: Path, policy: str, *changes: str) -> Trainer:
     return runs.prepare(data, out, settings, runs.Machine(device="cpu"))
 
 
-def windows_of(data: Path, policy: Policy) -> Batch:
+def windows_of(data: Path, policy: PolicyNetwork) -> Batch:
     """Every window of a dataset."""
     corpus = load_corpus(open_source(data), data)
     settings = policy.spec.settings
@@ -69,7 +69,7 @@ def windows_of(data: Path, policy: Policy) -> Batch:
     return Gatherer(corpus, policy.spec.layout, settings, policy.spec.tasks).gather(every)
 
 
-def plan(policy: Policy, batch: Batch) -> list[torch.Tensor]:
+def plan(policy: PolicyNetwork, batch: Batch) -> list[torch.Tensor]:
     """Action, flow and pose, as far as it predicts them."""
     made = policy.plan(batch, torch.Generator().manual_seed(3))
     return [t for t in (made.action, made.flow, made.object_pose) if t is not None]

@@ -25,7 +25,7 @@ from flowlab.learning.denoiser import (
     make_denoiser,
     modulate,
 )
-from flowlab.learning.policy import Policy
+from flowlab.learning.policy import PolicyNetwork
 from flowlab.learning.settings import DenoiserSettings, load_settings
 
 HORIZON, CHANNELS, CONDITION, STEPS = 8, 3, 5, 20
@@ -258,7 +258,7 @@ def test_the_unet_is_wired_as_diffusion_policys() -> None:
 
 def test_a_unet_of_simpledp3s_size_has_its_number_of_weights() -> None:
     widths = "action={kind: unet, widths: [128, 256, 384], step_embedding: 128}"
-    policy = Policy(tiny_spec(load_settings("paper", "dp3", [widths]), tasks=("roll",)))
+    policy = PolicyNetwork(tiny_spec(load_settings("paper", "dp3", [widths]), tasks=("roll",)))
     assert policy.spec.settings.horizon == 16
     assert sum(p.numel() for p in policy.parameters()) == pytest.approx(7.4e6, rel=0.01)
 
@@ -302,5 +302,7 @@ def test_queries_hear_of_each_other_and_know_where_they_are() -> None:
 
 
 def test_a_profile_says_which_network_is_made() -> None:
-    kinds = [type(Policy(tiny_spec(tiny_settings("dp3", f"action.kind={kind}"))).action) for kind in ("mlp", "unet")]
+    kinds = [
+        type(PolicyNetwork(tiny_spec(tiny_settings("dp3", f"action.kind={kind}"))).action) for kind in ("mlp", "unet")
+    ]
     assert kinds == [MLP, UNet]

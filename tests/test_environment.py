@@ -260,3 +260,17 @@ def test_poses_are_copies() -> None:
 
 if __name__ == "__main__":
     print(json.dumps({task: digest(Simulation(task, SceneSettings()), 3) for task in sys.argv[1:]}))
+
+
+@pytest.mark.parametrize("task", ["pick-place", "push"])
+def test_what_the_fingers_hold_is_what_metaworld_says(task: str) -> None:
+    simulation = Simulation(task, SceneSettings())
+    simulation.reset(3)
+    env, expert = simulation._env, simulation.expert()
+    geom = int(env._get_id_main_object())
+    said = []
+    for _ in range(70):
+        simulation.step(expert.act())
+        said.append(type(env).touching_object(env, geom))
+        assert env.touching_object(geom) == said[-1]
+    assert set(said) == {True, False}, "the episode shows both"

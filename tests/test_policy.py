@@ -11,7 +11,7 @@ from torch import Tensor
 
 from flowlab.learning.batches import Batch
 from flowlab.learning.layout import Layout
-from flowlab.learning.policy import Losses, Policy
+from flowlab.learning.policy import Losses, PolicyNetwork
 
 HISTORY, HORIZON, M, A = 2, 8, 6, 4
 VARIANTS = [
@@ -29,14 +29,14 @@ EVERY_VARIANT = pytest.mark.parametrize(
 MOTIONS = pytest.mark.parametrize(("name", "layout"), [("mba", "channels"), ("fdp", "channels"), ("fdp", "per-query")])
 
 
-def make(name: str, *overrides: str, places: Layout | None = None, **changes: Any) -> tuple[Policy, Batch]:
+def make(name: str, *overrides: str, places: Layout | None = None, **changes: Any) -> tuple[PolicyNetwork, Batch]:
     """A policy with random weights, and all windows of three demonstrations."""
     spec = tiny_spec(tiny_settings(name, *overrides), layout=places or Layout(), **changes)
     torch.manual_seed(0)
-    return Policy(spec), random_batch(spec.settings, spec.layout)
+    return PolicyNetwork(spec), random_batch(spec.settings, spec.layout)
 
 
-def variant(name: str, network: str, layout: str, *overrides: str, **changes: Any) -> tuple[Policy, Batch]:
+def variant(name: str, network: str, layout: str, *overrides: str, **changes: Any) -> tuple[PolicyNetwork, Batch]:
     networks = f"action={network}", f"motion.denoiser={network}", f"motion.layout={layout}"
     return make(name, *networks, *overrides, **changes)
 
@@ -84,7 +84,9 @@ def test_parts_of_a_batch_have_the_losses_and_gradients_of_the_whole(name: str, 
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-6)
 
 
-def answer(policy: Policy, monkeypatch: pytest.MonkeyPatch, action: Tensor, motion: Tensor | None = None) -> None:
+def answer(
+    policy: PolicyNetwork, monkeypatch: pytest.MonkeyPatch, action: Tensor, motion: Tensor | None = None
+) -> None:
     """Have the networks predict these, in normalised units, whatever they see."""
 
     def always(answer: Tensor) -> Any:
@@ -333,7 +335,7 @@ def shifted(batch: Batch, by: Tensor) -> Batch:
     return replace(batch, **changes)
 
 
-def networks_see(policy: Policy, batch: Batch) -> dict[str, Tensor]:
+def networks_see(policy: PolicyNetwork, batch: Batch) -> dict[str, Tensor]:
     """What enters the networks of a policy in training."""
     seen: dict[str, Tensor] = {}
     hooks = [
@@ -442,7 +444,7 @@ def test_tasks_are_told_apart_where_there_are_several(name: str, network: str, l
     plan = policy.plan(batch, generator())
     other = policy.plan(replace(batch, task=1 - batch.task), generator())
     assert (plan.action - other.action).abs().amax((1, 2)).min() > 1e-5
-    alone = Policy(tiny_spec(policy.spec.settings, tasks=("roll",)))
+    alone = PolicyNetwork(tiny_spec(policy.spec.settings, tasks=("roll",)))
     assert alone.encoder.task is None
     assert alone.encoder.features == policy.encoder.features - 32
     same, swapped = (alone.plan(b, generator()).action for b in (batch, replace(batch, task=1 - batch.task)))

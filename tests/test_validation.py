@@ -11,7 +11,7 @@ from tiny import every_window, random_corpus, tiny_settings, tiny_spec
 from flowlab.learning.batches import Batch, Context, Gatherer, Windows
 from flowlab.learning.corpus import Corpus, Demo
 from flowlab.learning.layout import Layout
-from flowlab.learning.policy import Plan, Policy
+from flowlab.learning.policy import Generators, Plan, PolicyNetwork
 from flowlab.learning.settings import TrainSettings
 from flowlab.learning.validation import validate
 
@@ -19,14 +19,14 @@ NOW, HORIZON, EXECUTED, LENGTH = 1, 8, 4, 30
 STEP_M = 0.01
 
 
-class Oracle(Policy):
+class Oracle(PolicyNetwork):
     """Plans what was demonstrated, and so much more."""
 
     action_off = 0.0
     flow_off = pose_off = (0.0, 0.0, 0.0)
     from_row, to_row = 0, HORIZON
 
-    def plan(self, context: Context, generator: torch.Generator | None = None) -> Plan:
+    def plan(self, context: Context, noise_from: Generators = None) -> Plan:
         assert isinstance(context, Batch)
         rows = slice(self.from_row, self.to_row)
         flow, pose = context.flow.clone(), context.object_pose.clone()
@@ -70,7 +70,7 @@ def rolling(demos: int = 2) -> Corpus:
     )
 
 
-def errors(corpus: Corpus, policy: Policy, rows: list[int] | None = None) -> dict[str, float]:
+def errors(corpus: Corpus, policy: PolicyNetwork, rows: list[int] | None = None) -> dict[str, float]:
     """The errors in all windows, or in those of the first demonstration's that are decided on at some rows."""
     s = policy.spec.settings
     windows = every_window(corpus, s)
@@ -202,7 +202,7 @@ def test_the_position_of_an_object_is_off_by_so_many_mm() -> None:
 
 def test_a_real_policy_has_the_same_errors_each_time() -> None:
     torch.manual_seed(0)
-    policy = Policy(tiny_spec(tiny_settings("fdp")))
+    policy = PolicyNetwork(tiny_spec(tiny_settings("fdp")))
     first = errors(random_corpus(), policy)
     torch.manual_seed(1)
     assert errors(random_corpus(), policy) == first
@@ -213,10 +213,10 @@ def test_of_many_windows_some_are_looked_at_evenly_spaced() -> None:
     seen: list[float] = []
 
     class Counting(Oracle):
-        def plan(self, context: Context, generator: torch.Generator | None = None) -> Plan:
+        def plan(self, context: Context, noise_from: Generators = None) -> Plan:
             assert len(context.observed) <= 64
             seen.extend(context.state[context.observed[:, -1], 0].tolist())
-            return super().plan(context, generator)
+            return super().plan(context, noise_from)
 
     settings = tiny_settings("dp3")
     corpus = random_corpus([("roll", 1003)], points=24)

@@ -93,7 +93,7 @@ def _label(
     from flowlab.pipeline.real_run import track_recordings
 
     start = time.monotonic()
-    engine = partial(LocalEngine, workers=workers, stages="flowlab.pipeline.real_stages")
+    engine = partial(LocalEngine, workers=workers, imports=["flowlab.pipeline.real_stages"])
     with ProgressBar(quiet=as_json) as bar:
 
         def show(progress: Progress) -> None:

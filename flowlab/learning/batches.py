@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -37,6 +37,10 @@ class Context:
     task: Tensor
     """(W,): index of the task."""
 
+    def to(self, device: torch.device) -> Self:
+        """The same on another device."""
+        return type(self)(**{f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)})
+
 
 @dataclass(frozen=True, slots=True)
 class Batch(Context):
@@ -60,10 +64,6 @@ class Batch(Context):
         frame, observed = torch.unique(self.observed[windows], return_inverse=True)
         mine = {f.name: getattr(self, f.name)[windows] for f in fields(self)}
         return Batch(**mine | {"points": self.points[frame], "state": self.state[frame], "observed": observed})
-
-    def to(self, device: torch.device) -> "Batch":
-        """The same on another device."""
-        return Batch(**{f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)})
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,8 @@ from torch import Tensor
 from flowlab import __version__
 from flowlab.config import Settings, explain
 from flowlab.errors import DataError, UsageError
-from flowlab.learning.policy import Policy, PolicySpec
+from flowlab.learning.corpus import Corpus
+from flowlab.learning.policy import PolicyNetwork, PolicySpec
 from flowlab.learning.source import Source
 from flowlab.storage.files import read_json, remove_leftovers, temporary_path, write_json
 from flowlab.storage.manifest import differences
@@ -28,6 +29,7 @@ RUN = "run.json"
 RESUME = "resume.safetensors"
 CHECKPOINTS = "checkpoints"
 _FORMAT = 1
+_ADVICE = "delete it to use the checkpoint before it"
 Model = TypeVar("Model", bound=Settings)
 
 
@@ -40,14 +42,26 @@ class Trained(Settings):
     """Path of the dataset as it was given."""
     fingerprint: str
     """Of the dataset's content."""
+    layouts: Mapping[str, tuple[int, ...]] = {}
+    """Seeds of all simulated layouts in the dataset, by task, so that nobody evaluates on them."""
+    scene: Mapping[str, Any] | None = None
+    """Settings of the simulated scene; None where the dataset was recorded."""
     versions: Mapping[str, str]
     """Of what it was trained with."""
 
     @classmethod
-    def now(cls, policy: PolicySpec, source: Source) -> "Trained":
+    def now(cls, policy: PolicySpec, source: Source, corpus: Corpus) -> "Trained":
         """A policy trained on a source by this flowlab."""
-        versions = {"flowlab": __version__, "torch": torch.__version__, "numpy": numpy.__version__}
-        return cls(policy=policy, dataset=str(source.path), fingerprint=source.fingerprint, versions=versions)
+        expert = source.settings.get("expert")
+        seeds = {t: tuple(d.seed for d in corpus.demos if d.task == t) for t in corpus.tasks}
+        return cls(
+            policy=policy,
+            dataset=str(source.path),
+            fingerprint=source.fingerprint,
+            layouts=seeds if expert else {},
+            scene=expert["scene"] if expert else None,
+            versions={"flowlab": __version__, "torch": torch.__version__, "numpy": numpy.__version__},
+        )
 
 
 class Run(Settings):
@@ -70,7 +84,7 @@ class Run(Settings):
 class Loaded:
     """A policy from disk, ready for use."""
 
-    policy: Policy
+    policy: PolicyNetwork
     trained: Trained
     step: int
     """Training steps its weights have seen."""
@@ -83,16 +97,31 @@ def load_policy(path: Path, device: str = "cpu") -> Loaded:
 
     Raises :class:`DataError` where there is none, or it is damaged.
     """
-    weights = path if path.suffix == ".safetensors" else _newest(path)
+    weights = path if path.suffix == ".safetensors" else newest_checkpoint(path)
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
-    tensors, step = _read(weights, "delete it to use the checkpoint before it")
-    policy = Policy(trained.policy).requires_grad_(False).eval()
+    tensors, step = _read(weights, _ADVICE)
+    policy = PolicyNetwork(trained.policy).requires_grad_(False).eval()
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:
         raise DataError(f"{weights}: does not fit {folder / POLICY}; restore both from one run") from error
     return Loaded(policy.to(device), trained, step, weights)
+
+
+def newest_checkpoint(run: Path) -> Path:
+    """The weights of a run that have seen most steps. Raises :class:`DataError` where there are none."""
+    read_trained(run)
+    kept = sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
+    if not kept:
+        raise DataError(f"{run}: has no checkpoint yet; resume it with 'flowlab train {run} --resume'")
+    return kept[-1]
+
+
+def step_of(weights: Path) -> int:
+    """Training steps that a checkpoint has seen. Raises :class:`DataError` where it is damaged."""
+    with _understood(weights, _ADVICE), safetensors.safe_open(weights, "pt") as file:
+        return int((file.metadata() or {})["step"])
 
 
 def read_trained(folder: Path) -> Trained:
@@ -125,7 +154,7 @@ def check_observer(trained: Trained, where: Path, source: Source) -> None:
         )
 
 
-def keep_weights(folder: Path, policy: Policy, step: int) -> Path:
+def keep_weights(folder: Path, policy: PolicyNetwork, step: int) -> Path:
     """Keep the weights of a policy as a checkpoint of a run."""
     path = folder / CHECKPOINTS / f"step-{step:08d}.safetensors"
     path.parent.mkdir(exist_ok=True)
@@ -178,14 +207,6 @@ def start_folder(folder: Path, trained: Trained, run: Run) -> None:
         write_json(folder / RUN, json.loads(run.model_dump_json()))
 
 
-def _newest(run: Path) -> Path:
-    read_trained(run)
-    kept = sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
-    if not kept:
-        raise DataError(f"{run}: has no checkpoint yet; resume it with 'flowlab train {run} --resume'")
-    return kept[-1]
-
-
 def _write(path: Path, tensors: Mapping[str, Tensor], about: dict[str, str]) -> None:
     temporary = temporary_path(path)
     try:
@@ -198,12 +219,19 @@ def _write(path: Path, tensors: Mapping[str, Tensor], about: dict[str, str]) -> 
 
 def _read(path: Path, advice: str) -> tuple[dict[str, Tensor], int]:
     """Tensors, and the step they are of."""
-    if not path.exists():
-        raise DataError(f"{path}: there is no such checkpoint")
-    try:
+    with _understood(path, advice):
         with safetensors.safe_open(path, "pt") as file:
             about = file.metadata() or {}
         return load_file(path), int(about["step"])
+
+
+@contextmanager
+def _understood(path: Path, advice: str) -> Iterator[None]:
+    """Turns a failure to read weights into a sentence."""
+    if not path.exists():
+        raise DataError(f"{path}: there is no such checkpoint")
+    try:
+        yield
     except KeyError as error:
         raise DataError(f"{path}: not written by flowlab (it does not tell its step); {advice}") from error
     except (OSError, safetensors.SafetensorError) as error:

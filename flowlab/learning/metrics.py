@@ -71,6 +71,12 @@ def last_of(path: Path, kind: str) -> dict[str, float]:
     return {k: v for k, v in lines[-1].items() if k not in ("kind", "step", "cpu_s", "wall_s")} if lines else {}
 
 
+def spent(path: Path) -> float:
+    """CPU time up to the newest line [s]."""
+    lines = _whole_lines(path)
+    return float(json.loads(lines[-1])["cpu_s"]) if lines else 0.0
+
+
 def _whole_lines(path: Path) -> list[str]:
     """Lines of the file; the last is left out where a kill cut it off."""
     lines = path.read_text().split("\n") if path.exists() else []

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from flowlab.learning.policy import Policy
+from flowlab.learning.policy import PolicyNetwork
 from flowlab.learning.settings import OptimiserSettings
 
 Tensors = dict[str, Tensor]
@@ -16,7 +16,7 @@ Tensors = dict[str, Tensor]
 class Optimisers:
     """One AdamW for each module that is trained apart, on one schedule."""
 
-    def __init__(self, policy: Policy, settings: OptimiserSettings, steps: int) -> None:
+    def __init__(self, policy: PolicyNetwork, settings: OptimiserSettings, steps: int) -> None:
         self._settings = settings
         self._steps = steps
         self._warmup = max(1, min(settings.warmup_steps, steps // 10))
@@ -66,12 +66,12 @@ class Optimisers:
 class Average:
     """Exponential moving average of a policy's weights: what is validated, kept and used."""
 
-    def __init__(self, policy: Policy, settings: OptimiserSettings) -> None:
+    def __init__(self, policy: PolicyNetwork, settings: OptimiserSettings) -> None:
         self.policy = copy.deepcopy(policy).requires_grad_(False).eval()
         self._settings = settings
         self._mine: list[Tensor] = list(self.policy.parameters())
 
-    def update(self, policy: Policy, step: int) -> None:
+    def update(self, policy: PolicyNetwork, step: int) -> None:
         """Take in the weights after a step."""
         kept = min(1 - (1 + step) ** -self._settings.ema_power, self._settings.ema_max)
         torch._foreach_lerp_(self._mine, [p.detach() for p in policy.parameters()], 1 - kept)

@@ -1,6 +1,6 @@
 """The policies: one encoder, one family of denoisers; 3D FDP and MBA predict a motion before the action."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,8 @@ from flowlab.learning.normaliser import Normaliser, Scaler
 from flowlab.learning.settings import TrainSettings
 
 _TASK_FEATURES = 32
+Generators = torch.Generator | Sequence[torch.Generator] | None
+"""Where the noise of plans comes from."""
 
 
 class PolicySpec(Settings):
@@ -57,7 +59,7 @@ class Plan:
     """(W, T, 9): MBA's."""
 
 
-class Policy(nn.Module):
+class PolicyNetwork(nn.Module):
     """A diffusion policy on point clouds."""
 
     def __init__(self, spec: PolicySpec) -> None:
@@ -114,10 +116,11 @@ class Policy(nn.Module):
         return Losses(total, action_loss, motion_loss)
 
     @torch.no_grad()
-    def plan(self, context: Context, generator: torch.Generator | None = None) -> Plan:
+    def plan(self, context: Context, noise_from: Generators = None) -> Plan:
         """Decide on actions for every window of a context.
 
-        ``generator`` is a CPU generator; the noise, and so the plan, is a function of its state.
+        ``noise_from`` is a CPU generator, or one for each window; the noise, and so the plan, is a function of their
+        states.
         """
         s = self.spec.settings
         windows, device = len(context.observed), context.points.device
@@ -125,7 +128,9 @@ class Policy(nn.Module):
         condition = self.encoder(context, self._relative(context.points, context.state))
 
         def noise(*shape: int) -> Tensor:
-            return torch.randn(windows, *shape, generator=generator).to(device)
+            if not isinstance(noise_from, Sequence):
+                return torch.randn(windows, *shape, generator=noise_from).to(device)
+            return torch.stack([torch.randn(shape, generator=g) for g in noise_from]).to(device)
 
         motion = None
         if self.motion is not None:

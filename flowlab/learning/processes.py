@@ -12,7 +12,7 @@ from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from flowlab.errors import UsageError
-from flowlab.learning.policy import Policy
+from flowlab.learning.policy import PolicyNetwork
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Of ``malloc.h``."""
@@ -63,7 +63,7 @@ class Processes:
         size = windows // self.count
         return slice(self.rank * size, (self.rank + 1) * size)
 
-    def wrap(self, policy: Policy) -> nn.Module:
+    def wrap(self, policy: PolicyNetwork) -> nn.Module:
         """The policy as it is called for its losses: with several processes, gradients become those of all parts."""
         if self.count == 1:
             return policy

@@ -28,7 +28,7 @@ from flowlab.learning.layout import find_layout
 from flowlab.learning.logs import LOGS, make_log
 from flowlab.learning.metrics import Metrics
 from flowlab.learning.normaliser import fit
-from flowlab.learning.policy import Policy, PolicySpec
+from flowlab.learning.policy import PolicyNetwork, PolicySpec
 from flowlab.learning.processes import Processes
 from flowlab.learning.settings import TrainSettings
 from flowlab.learning.source import Source, open_source
@@ -92,7 +92,7 @@ def prepare(
         planned = planned.model_copy(update={"steps": processes.tell(steps)})
     trainer = Trainer(out, planned, policy, corpus, processes)
     if processes.is_first:
-        start_folder(out, Trained.now(policy.spec, source), planned)
+        start_folder(out, Trained.now(policy.spec, source, corpus), planned)
         trainer.keep()
     processes.wait()
     return trainer
@@ -114,7 +114,7 @@ def resume(folder: Path, **changes: Any) -> Trainer:
             "restore the dataset, or start a new run"
         )
     step, groups = read_resume(folder)
-    trainer = Trainer(folder, kept, Policy(trained.policy), load_corpus(source, folder), processes)
+    trainer = Trainer(folder, kept, PolicyNetwork(trained.policy), load_corpus(source, folder), processes)
     trainer.take_up(step, groups)
     return trainer
 
@@ -138,7 +138,7 @@ def _silent(progress: Progress) -> None:
     """Only the first process reports."""
 
 
-def _make_policy(source: Source, corpus: Corpus, settings: TrainSettings, began_from: Path | None) -> Policy:
+def _make_policy(source: Source, corpus: Corpus, settings: TrainSettings, began_from: Path | None) -> PolicyNetwork:
     if settings.policy == "mba" and corpus.object_pose.shape[1] != 9:
         raise DataError(
             f"{source.path}: has no object poses, which mba learns to predict; train --policy fdp, which learns from "
@@ -158,10 +158,10 @@ def _make_policy(source: Source, corpus: Corpus, settings: TrainSettings, began_
     )
     torch.manual_seed(settings.run.seed)
     if loaded is None:
-        return Policy(spec)
+        return PolicyNetwork(spec)
     check_observer(loaded.trained, loaded.path, source)
     old = loaded.trained.policy
-    policy = Policy(spec.model_copy(update={"normaliser": old.normaliser, "layout": old.layout}))
+    policy = PolicyNetwork(spec.model_copy(update={"normaliser": old.normaliser, "layout": old.layout}))
     try:
         policy.load_state_dict(loaded.policy.state_dict())
     except RuntimeError as error:

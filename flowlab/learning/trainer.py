@@ -15,7 +15,7 @@ from flowlab.learning.corpus import Corpus
 from flowlab.learning.diffusion import Draws
 from flowlab.learning.metrics import Means, Metrics
 from flowlab.learning.optimising import Average, Optimisers
-from flowlab.learning.policy import Policy
+from flowlab.learning.policy import PolicyNetwork
 from flowlab.learning.processes import Processes
 from flowlab.learning.validation import validate
 
@@ -44,7 +44,7 @@ class Diverged(FlowlabError):
 class Trainer:
     """Trains one policy on one corpus, in one or several processes."""
 
-    def __init__(self, folder: Path, run: Run, policy: Policy, corpus: Corpus, processes: Processes) -> None:
+    def __init__(self, folder: Path, run: Run, policy: PolicyNetwork, corpus: Corpus, processes: Processes) -> None:
         settings = policy.spec.settings
         self.folder, self.run, self.policy, self.processes = folder, run, policy.to(processes.device), processes
         self.settings = settings

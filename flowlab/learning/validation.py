@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from flowlab.learning.batches import Batch, Gatherer, Windows
-from flowlab.learning.policy import Plan, Policy
+from flowlab.learning.policy import Plan, PolicyNetwork
 
 MOVING_M = 0.005
 """A query point, or object, that gets farther than this from where it is now [m] within a window counts as moving."""
@@ -16,7 +16,7 @@ _WINDOWS = 256
 _AT_ONCE = 64
 
 
-def validate(policy: Policy, gatherer: Gatherer, windows: Windows, device: torch.device) -> dict[str, float]:
+def validate(policy: PolicyNetwork, gatherer: Gatherer, windows: Windows, device: torch.device) -> dict[str, float]:
     """Errors of a policy's plans on some windows; the same noise each time.
 
     ``action_l1``: mean absolute error of the executed actions, in the dataset's units; ``_zero`` and ``_hold`` are
@@ -27,7 +27,7 @@ def validate(policy: Policy, gatherer: Gatherer, windows: Windows, device: torch
     """
     generator = torch.Generator().manual_seed(0)
     sums: dict[str, np.ndarray] = {}
-    for part in _parts(windows):
+    for part in portions(windows):
         batch = gatherer.gather(part).to(device)
         for name, (total, count) in _errors(policy, batch, policy.plan(batch, generator)).items():
             sums[name] = sums.get(name, np.zeros(2)) + np.array([float(total), float(count)])
@@ -39,14 +39,14 @@ def validate(policy: Policy, gatherer: Gatherer, windows: Windows, device: torch
     }
 
 
-def _parts(windows: Windows) -> Iterator[Windows]:
+def portions(windows: Windows) -> Iterator[Windows]:
     """Evenly spaced windows, in handy portions; each a run of its own."""
     index = np.unique(np.linspace(0, len(windows.now) - 1, _WINDOWS).astype(int))
     for part in np.array_split(index, -(-len(index) // _AT_ONCE)):
         yield Windows(windows.demo[part], windows.now[part], np.zeros(len(part), int))
 
 
-def _errors(policy: Policy, batch: Batch, plan: Plan) -> dict[str, tuple[Tensor, Tensor]]:
+def _errors(policy: PolicyNetwork, batch: Batch, plan: Plan) -> dict[str, tuple[Tensor, Tensor]]:
     """Sum and count of every error."""
     s = policy.spec.settings
     now = s.history - 1
@@ -63,12 +63,23 @@ def _errors(policy: Policy, batch: Batch, plan: Plan) -> dict[str, tuple[Tensor,
     return errors
 
 
-def _flow_errors(batch: Batch, flow: Tensor, now: int) -> dict[str, tuple[Tensor, Tensor]]:
+def true_motion(batch: Batch, now: int) -> tuple[Tensor, Tensor, Tensor]:
+    """How far every query point gets from where it is now, step by step (W, K, M, 3) [m]; what of it the labels cover
+    (W, K, M); and which points move (W, 1, M)."""
     known = (batch.flow_weight[:, now:] > 0).cummin(1).values
     true = batch.flow[:, now:].cumsum(1)
-    moving = ((true.norm(dim=-1) > MOVING_M) & known).any(1, keepdim=True)
-    last = batch.flow[:, max(now - 1, 0)]
-    guesses = {"": flow[:, now:].cumsum(1), "_zero": torch.zeros_like(true), "_constant": _continued(last, true)}
+    return true, known, ((true.norm(dim=-1) > MOVING_M) & known).any(1, keepdim=True)
+
+
+def constant_motion(batch: Batch, now: int) -> Tensor:
+    """The same (W, K, M, 3) [m], if the motion of the step before now went on."""
+    return _continued(batch.flow[:, max(now - 1, 0)], batch.flow[:, now:])
+
+
+def _flow_errors(batch: Batch, flow: Tensor, now: int) -> dict[str, tuple[Tensor, Tensor]]:
+    true, known, moving = true_motion(batch, now)
+    continued = constant_motion(batch, now)
+    guesses = {"": flow[:, now:].cumsum(1), "_zero": torch.zeros_like(true), "_constant": continued}
     return {
         f"flow_{kind}_mm{name}": _sum(1e3 * (guess - true).norm(dim=-1), known & of_kind)
         for kind, of_kind in (("moving", moving), ("static", ~moving))

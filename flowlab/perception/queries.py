@@ -44,6 +44,16 @@ class QuerySettings(Settings):
     """Choose no points near edges and holes of the depth picture; null does, which is right where depth is exact."""
 
 
+def queries_in(cloud: Cloud, depth: Float32[np.ndarray, "H W"], settings: QuerySettings) -> Queries:
+    """The points to follow from a frame on, given its cloud and its depth picture.
+
+    Raises :class:`DataError` where there is none.
+    """
+    if settings.avoid_edges is not None:
+        cloud = away_from_edges(cloud, depth, settings.avoid_edges)
+    return sample_queries(cloud, settings)
+
+
 def sample_queries(cloud: Cloud, settings: QuerySettings) -> Queries:
     """Choose query points from a cloud; ``scene`` is nested, its first m of M are its sample of m.
 

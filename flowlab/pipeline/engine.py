@@ -5,19 +5,20 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Protocol, Self
+from typing import Generic, Protocol, Self, TypeVar
 
 from pebble import ProcessExpired, ProcessPool
 
 from flowlab.errors import FlowlabError
-from flowlab.pipeline.units import WorkUnit
 from flowlab.storage.files import is_running
-from flowlab.storage.manifest import Receipt
+
+Unit = TypeVar("Unit")
+Receipt = TypeVar("Receipt")
 
 _WORKER_ENVIRONMENT = (
     "OMP_NUM_THREADS",
@@ -31,50 +32,50 @@ _WORKER_ENVIRONMENT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(Generic[Unit, Receipt]):
     """What became of a unit: its receipt, or why there is none."""
 
-    unit: WorkUnit
+    unit: Unit
     receipt: Receipt | None
     failure: str = ""
     """Traceback, or how the worker died."""
 
 
-class Engine(Protocol):
-    """Runs units and hands back outcomes as they come; units never exchange arrays through it."""
+class Engine(Protocol[Unit, Receipt]):
+    """Runs units of some kind and hands back outcomes as they come; units never exchange arrays through it."""
 
-    def submit(self, unit: WorkUnit) -> None:
+    def submit(self, unit: Unit) -> None:
         """Start a unit as soon as there is room."""
         ...
 
-    def next_outcome(self) -> Outcome:
+    def next_outcome(self) -> Outcome[Unit, Receipt]:
         """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
         ...
 
 
-StartEngine = Callable[[Callable[[WorkUnit], Receipt]], AbstractContextManager[Engine]]
+StartEngine = Callable[[Callable[[Unit], Receipt]], AbstractContextManager[Engine[Unit, Receipt]]]
 """Makes an engine that does units with the given function; leaving the context stops it."""
 
 
-class LocalEngine:
+class LocalEngine(Generic[Unit, Receipt]):
     """A pool of processes on this machine.
 
-    A worker that dies loses its own unit only, which is tried once more in a fresh worker. ``stages`` is the module
-    of the stages they will need.
+    A worker that dies loses its own unit only, which is tried once more in a fresh worker. ``imports`` are the modules
+    that they will need.
     """
 
     def __init__(
-        self, work: Callable[[WorkUnit], Receipt], workers: int, stages: str = "flowlab.pipeline.stages"
+        self, work: Callable[[Unit], Receipt], workers: int, imports: Sequence[str] = ("flowlab.pipeline.stages",)
     ) -> None:
-        self._work, self._workers, self._stages = work, workers, stages
-        self._tries: dict[Future[Receipt], tuple[WorkUnit, int]] = {}
+        self._work, self._workers, self._imports = work, workers, imports
+        self._tries: dict[Future[Receipt], tuple[Unit, int]] = {}
 
     def __enter__(self) -> Self:
         for name in _WORKER_ENVIRONMENT:
             os.environ.setdefault(name, "1")
         # Workers are forked from a clean process that has imported everything once, and share its memory.
         context = get_context("forkserver")
-        context.set_forkserver_preload(["flowlab.pipeline.worker", self._stages])
+        context.set_forkserver_preload(["flowlab.pipeline.worker", *self._imports])
         self._pool = ProcessPool(
             max_workers=self._workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )
@@ -84,11 +85,11 @@ class LocalEngine:
         self._pool.stop()
         self._pool.join()
 
-    def submit(self, unit: WorkUnit) -> None:
+    def submit(self, unit: Unit) -> None:
         """Start a unit as soon as a worker is free."""
         self._schedule(unit, tries=1)
 
-    def next_outcome(self) -> Outcome:
+    def next_outcome(self) -> Outcome[Unit, Receipt]:
         """Wait for a unit to end."""
         while True:
             done, _ = wait(self._tries, return_when=FIRST_COMPLETED)
@@ -106,7 +107,7 @@ class LocalEngine:
             except Exception as error:
                 return Outcome(unit, None, "".join(traceback.format_exception(error)))
 
-    def _schedule(self, unit: WorkUnit, tries: int) -> None:
+    def _schedule(self, unit: Unit, tries: int) -> None:
         self._tries[self._pool.schedule(self._work, args=[unit])] = unit, tries
 
 

@@ -16,11 +16,11 @@ from flowlab.pipeline.real_stages import QualityStage, RecordingStage, TrackStag
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.run import fill
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
-from flowlab.pipeline.units import Share
+from flowlab.pipeline.units import Share, WorkUnit
 from flowlab.real.metadata import FILE_NAME, combine, load_metadata
 from flowlab.real.recording import Description, Recording, RecordingSettings, describe, find_recordings
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import Manifest, read_receipts
+from flowlab.storage.manifest import Manifest, Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
 from flowlab.tracking.tracker import make_tracker
 
@@ -68,7 +68,7 @@ def track_recordings(
     recordings: Sequence[Recorded],
     folder: Path,
     *,
-    start_engine: StartEngine,
+    start_engine: StartEngine[WorkUnit, Receipt],
     share: Share = Share(),
     report: Callable[[Progress], None] = lambda _: None,
 ) -> Dataset:

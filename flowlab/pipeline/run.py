@@ -55,7 +55,7 @@ def extract(
     tasks: tuple[str, ...],
     folder: Path,
     *,
-    start_engine: StartEngine,
+    start_engine: StartEngine[WorkUnit, Receipt],
     share: Share = Share(),
     report: Callable[[Progress], None] = lambda _: None,
 ) -> Dataset:
@@ -77,7 +77,7 @@ def fill(
     plan_for: Callable[[Manifest], Plan],
     folder: Path,
     *,
-    start_engine: StartEngine,
+    start_engine: StartEngine[WorkUnit, Receipt],
     share: Share,
     report: Callable[[Progress], None],
 ) -> Dataset:
@@ -144,12 +144,12 @@ def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int)
 
 
 def run_all(
-    engine: Engine, plan: Plan, folder: Path, share: Share, report: Callable[[Progress], None]
-) -> list[Outcome]:
+    engine: Engine[WorkUnit, Receipt], plan: Plan, folder: Path, share: Share, report: Callable[[Progress], None]
+) -> list[Outcome[WorkUnit, Receipt]]:
     """Submit units and collect outcomes until nothing is left that this run could do; returns the failures."""
     receipts = _receipts_by_unit(folder)
     under_way: dict[str, WorkUnit] = {}
-    failures: list[Outcome] = []
+    failures: list[Outcome[WorkUnit, Receipt]] = []
     next_summary = time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
     while True:
         taken = [*under_way.values(), *(f.unit for f in failures)]

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
-from flowlab.perception.queries import QuerySettings, away_from_edges, sample_queries
+from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.pipeline.stage import Rejected, Stage, Writer
 from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo, Tracks3D
 from flowlab.storage.shard import write_shard
@@ -82,11 +82,8 @@ class QueriesStage(Stage, QuerySettings):
 
     def process(self, record: ObservedDemo) -> QueriedDemo:
         """Choose the points to follow."""
-        cloud = record.first_cloud
         try:
-            if self.avoid_edges is not None:
-                cloud = away_from_edges(cloud, record.depth[0], self.avoid_edges)
-            return QueriedDemo(record, sample_queries(cloud, self))
+            return QueriedDemo(record, queries_in(record.first_cloud, record.depth[0], self))
         except DataError as error:
             raise Rejected(str(error)) from error
 

@@ -5,12 +5,11 @@ from typing import Literal, Protocol
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from pydantic import Field
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError
-from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import pose_9d, rigid
 from flowlab.records import Demonstration, Frame
 from flowlab.sim.environment import SceneSettings, Simulation, dp3_camera
@@ -54,17 +53,58 @@ class Rollout(Demonstration):
         return replace(self.renderer.frame(self.poses.at(t)), camera=self.camera)
 
 
-@dataclass(frozen=True, slots=True)
 class Live:
-    """The simulation's camera, now."""
+    """An episode under way: looked at and acted in step by step, and remembered as poses."""
 
-    simulation: Simulation
-    renderer: Renderer
-    camera: Camera
+    def __init__(self, simulation: Simulation, seed: int, renderer: Renderer) -> None:
+        self.simulation, self.seed, self.renderer = simulation, seed, renderer
+        self.camera, self.T_world_sim = simulation.camera(), np.eye(4)
+        if simulation.settings.convention == "dp3":
+            self.camera, self.T_world_sim = dp3_camera(self.camera)
+        self._poses: list[Poses] = []
+        self._state: list[np.ndarray] = []
+        self._action: list[np.ndarray] = []
+        self.success: list[bool] = []
+        """Whether the task counted as solved, after every action so far."""
 
     def frame(self) -> Frame:
         """The picture of this moment."""
         return replace(self.renderer.frame(self.simulation.poses()), camera=self.camera)
+
+    @property
+    def unstable(self) -> bool:
+        """Whether the physics broke down; then MuJoCo has started it anew, and what follows means nothing."""
+        return bool(self.simulation.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
+
+    def step(self, action: Float32[np.ndarray, "4"]) -> bool:
+        """Execute an action; whether the task now counts as solved."""
+        sim = self.simulation
+        self._poses.append(sim.poses())
+        self._state.append(sim.state)
+        self._action.append(action)
+        self.success.append(sim.step(action))
+        return self.success[-1]
+
+    def rollout(self) -> Rollout:
+        """All of the episode so far, at least one step."""
+        sim, poses = self.simulation, Poses.stack(self._poses)
+        body = sim.object_body
+        T_sim_object = rigid(poses.body_mat[:, body].reshape(-1, 3, 3), poses.body_pos[:, body])
+        return Rollout(
+            task=sim.task.name,
+            seed=self.seed,
+            camera=self.camera,
+            time_s=np.arange(len(self._action)) * sim.step_seconds,
+            state=np.stack(self._state),
+            action=np.stack(self._action),
+            success=np.array(self.success),
+            object_pose=pose_9d(self.T_world_sim @ T_sim_object).astype(np.float32),
+            extras={"rand_vec": sim.rand_vec.tolist()},
+            poses=poses,
+            scene=sim.scene,
+            renderer=self.renderer,
+            T_world_sim=self.T_world_sim,
+        )
 
 
 class Studio:
@@ -88,58 +128,23 @@ class Studio:
             self._gl = GLRenderer(sim.scene, sim.camera(), sim.settings)
         return self._gl
 
-    def live(self) -> "Live":
-        """A look at the simulation as it goes on from its last reset."""
+    def begin(self, seed: int) -> Live:
+        """An episode with the layout of ``seed``. It ends when the next begins."""
         sim = self.simulation
-        camera = sim.camera()
-        if sim.settings.convention == "dp3":
-            camera, _ = dp3_camera(camera)
-        return Live(sim, self.renderer(sim.poses()), camera)
+        sim.reset(seed)
+        return Live(sim, seed, self.renderer(sim.poses()))
 
     def record_expert(self, seed: int, settings: ExpertSettings) -> Rollout:
         """Let the expert solve the layout of ``seed``, or try to until ``max_steps``.
 
         Raises :class:`DataError` where the physics becomes unstable.
         """
-        sim = self.simulation
-        sim.reset(seed)
-        expert = sim.expert()
-        poses: list[Poses] = []
-        states: list[np.ndarray] = []
-        actions: list[np.ndarray] = []
-        successes: list[bool] = []
-        while len(actions) < settings.max_steps:
-            poses.append(sim.poses())
-            states.append(sim.state)
-            actions.append(expert.act())
-            successes.append(sim.step(actions[-1]))
-            if settings.stop == "success" and sum(successes) >= settings.hold:
+        live = self.begin(seed)
+        expert = self.simulation.expert()
+        while len(live.success) < settings.max_steps:
+            live.step(expert.act())
+            if settings.stop == "success" and sum(live.success) >= settings.hold:
                 break
-        if sim.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+        if live.unstable:
             raise DataError("the physics became unstable, and MuJoCo started it anew")
-        return self._rollout(seed, Poses.stack(poses), states, actions, successes)
-
-    def _rollout(
-        self, seed: int, poses: Poses, states: list[np.ndarray], actions: list[np.ndarray], successes: list[bool]
-    ) -> Rollout:
-        sim = self.simulation
-        camera, T_world_sim = sim.camera(), np.eye(4)
-        if sim.settings.convention == "dp3":
-            camera, T_world_sim = dp3_camera(camera)
-        body = sim.object_body
-        T_sim_object = rigid(poses.body_mat[:, body].reshape(-1, 3, 3), poses.body_pos[:, body])
-        return Rollout(
-            task=sim.task.name,
-            seed=seed,
-            camera=camera,
-            time_s=np.arange(len(actions)) * sim.step_seconds,
-            state=np.stack(states),
-            action=np.stack(actions),
-            success=np.array(successes),
-            object_pose=pose_9d(T_world_sim @ T_sim_object).astype(np.float32),
-            extras={"rand_vec": sim.rand_vec.tolist()},
-            poses=poses,
-            scene=sim.scene,
-            renderer=self.renderer(poses.at(0)),
-            T_world_sim=T_world_sim,
-        )
+        return live.rollout()

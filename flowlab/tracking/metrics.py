@@ -233,8 +233,20 @@ def _tapvid(
     settings: MetricSettings,
 ) -> TapVid3D:
     first = 0 if settings.count_query_frame else 1
-    error, stated, visible = error_m[first:], stated_visible[first:], truth.visible[first:]
-    pixel_m = truth.tracks_cam[first:, :, 2].astype(np.float64) / _focal_px(camera, settings)
+    z = truth.tracks_cam[first:, :, 2].astype(np.float64)
+    return tapvid(error_m[first:], stated_visible[first:], truth.visible[first:], z, camera, settings)
+
+
+def tapvid(
+    error: Float[np.ndarray, "*batch"],
+    stated: Bool[np.ndarray, "*batch"],
+    visible: Bool[np.ndarray, "*batch"],
+    z: Float[np.ndarray, "*batch"],
+    camera: Camera,
+    settings: MetricSettings | None = None,
+) -> TapVid3D:
+    """TAPVid-3D's figures for (point, instant) pairs: error [m], stated and true visibility, true z-depth [m]."""
+    pixel_m = z / _focal_px(camera, settings or MetricSettings())
     apd, jaccard = [], []
     for pixels in PIXELS:
         within = error < pixels * pixel_m
