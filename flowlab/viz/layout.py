@@ -13,8 +13,8 @@ DEPTH = f"{CAMERA}/depth"
 RGB = f"{CAMERA}/rgb"
 
 
-def layout(episode: Episode) -> rrb.Blueprint:
-    """The scene large, pictures and facts and plots beside it."""
+def layout(episode: Episode, *, flow_error: bool = False) -> rrb.Blueprint:
+    """The scene large, pictures and facts and plots beside it; ``flow_error`` says whether that is plotted."""
     pictures = [
         rrb.Spatial2DView(origin=CAMERA, contents=[f"+ {entity}"], name=name)
         for entity, name, there in [(RGB, "rgb", episode.rgb), (DEPTH, "depth", episode.depth)]
@@ -27,6 +27,8 @@ def layout(episode: Episode) -> rrb.Blueprint:
     if episode.tracks.quality is not None:
         name, percent = "stated error and visibility", rrb.ScalarAxis(range=(0, 100))
         plots.insert(0, _plot(name, ["+ /scalars/quality/**"], legend=True, axis_y=percent))
+    if flow_error:
+        plots.insert(0, _plot("flow error [mm]", ["+ /scalars/flow_error"], legend=False))
     # A depth picture under a pinhole would be unprojected into the scene, over the cloud.
     contents = ["+ /world/**", f"- {DEPTH}/**", f"- {RGB}/**"]
     floor = rr.components.Plane3D(up_from_world(episode.camera)[2], _box_up(episode)[0][2])

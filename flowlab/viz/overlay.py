@@ -1,10 +1,11 @@
-"""Query points and their trails, drawn over one enlarged picture of an episode."""
+"""Query points, their trails and what a policy expects of them, drawn over one enlarged picture of an episode."""
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float32, Int, UInt8
 
-from flowlab.records import Episode, Source
-from flowlab.viz.colours import track_rgb
+from flowlab.records import Episode, Foreseen, Source
+from flowlab.viz.colours import PREDICTED_RGB, track_rgb
+from flowlab.viz.forecasts import Forecast, forecasts
 from flowlab.viz.upright import upright_pixels
 
 _RIM = (16, 18, 22)
@@ -12,34 +13,38 @@ _RIM = (16, 18, 22)
 _HIDDEN_LIGHT = 0.75
 _TRAIL_ALPHA = (0.9, 0.7, 0.45, 0.22)
 """How opaque a trail is, from its newest quarter to its oldest."""
+_PATH_RIM_ALPHA = 0.5
+"""How opaque the rim of an expected path is: there are many, and they lie close."""
 _SUBPIXEL = 4
 """Bits of OpenCV's fixed-point coordinates."""
 
 
 class Overlay:
     """What is drawn over the pictures of an episode: a disc where a point is in sight, a ring where it is not,
-    a cross where its position was filled in; behind each, its trail.
+    a cross where its position was filled in; behind each, its trail. Between the two lie the paths that the plan in
+    force had foreseen, from where its points were when it was made.
 
     ``scale`` is how many canvas pixels a pixel of the picture has, ``trail`` (at least 1) how many steps a trail
     goes back.
     """
 
-    def __init__(self, episode: Episode, scale: int, trail: int) -> None:
+    def __init__(self, episode: Episode, scale: int, trail: int, foreseen: Foreseen | None = None) -> None:
         M, quality = episode.queries.count, episode.tracks.quality
-        uv = upright_pixels(episode.camera, episode.tracks.xyz_world[:, :M])
-        canvas_uv = (uv + 0.5) * scale - 0.5  # the centre of a pixel, enlarged
-        far = 8 * max(episode.camera.width, episode.camera.height) * scale  # OpenCV counts in 32 bits
-        self._there = np.all(np.abs(canvas_uv) < far, axis=-1)
-        self._uv = np.round(np.where(self._there[..., None], canvas_uv, 0) * 2**_SUBPIXEL).astype(np.int32)
+        self._episode, self._scale = episode, scale
+        self._uv, self._there = self._on_canvas(episode.tracks.xyz_world[:, :M])
         self._visible = episode.tracks.visible[:, :M]
         self._filled = np.zeros_like(self._visible) if quality is None else quality.source[:, :M] == Source.FILLED
         self._rgb = track_rgb(episode)
         self._trail = trail
         self._size = max(1.0, episode.camera.width * scale / 640)
+        self._plans = [] if foreseen is None else forecasts(episode, foreseen)
 
     def draw(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
-        """Draw trails and points of step t onto the canvas."""
+        """Draw trails, expected paths and points of step t onto the canvas."""
         self._draw_trails(canvas, t)
+        in_force = [plan for plan in self._plans if plan.step <= t]
+        if in_force:
+            self._draw_forecast(canvas, in_force[-1])
         there, visible, filled = self._there[t], self._visible[t], self._filled[t]
         for k in np.flatnonzero(there & filled):
             self._draw_cross(canvas, t, int(k))
@@ -47,6 +52,29 @@ class Overlay:
             self._draw_ring(canvas, t, int(k))
         for k in np.flatnonzero(there & ~filled & visible):
             self._draw_disc(canvas, t, int(k))
+
+    def _on_canvas(
+        self, xyz_world: Float32[np.ndarray, "*batch 3"]
+    ) -> tuple[Int[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
+        """Where points are on the canvas, in OpenCV's fixed point, and whether they are anywhere near it."""
+        camera, scale = self._episode.camera, self._scale
+        canvas_uv = (upright_pixels(camera, xyz_world) + 0.5) * scale - 0.5  # the centre of a pixel, enlarged
+        far = 8 * max(camera.width, camera.height) * scale  # OpenCV counts in 32 bits
+        there = np.all(np.abs(canvas_uv) < far, axis=-1)
+        return np.round(np.where(there[..., None], canvas_uv, 0) * 2**_SUBPIXEL).astype(np.int32), there
+
+    def _draw_forecast(self, canvas: UInt8[np.ndarray, "H W 3"], plan: Forecast) -> None:
+        """Thin bright lines, each with a dot at its end, as far as they can be seen from the camera."""
+        import cv2
+
+        uv, there = self._on_canvas(plan.expected_world[:, plan.stirs])
+        paths, ends = [path[ok] for path, ok in zip(uv.swapaxes(0, 1), there.T, strict=True)], uv[-1][there[-1]]
+        for width, radius, rgb, alpha in ((2.6, 3.2, _RIM, _PATH_RIM_ALPHA), (1.0, 2.4, PREDICTED_RGB, 1.0)):
+            layer = canvas.copy()
+            cv2.polylines(layer, paths, False, rgb, self._px(width), cv2.LINE_AA, _SUBPIXEL)
+            for end in ends.tolist():
+                cv2.circle(layer, end, self._sub(radius), rgb, -1, cv2.LINE_AA, _SUBPIXEL)
+            cv2.addWeighted(layer, alpha, canvas, 1 - alpha, 0, dst=canvas)
 
     def _draw_trails(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
         """The last steps of every point as pieces from step to step, the older the fainter; faint where the

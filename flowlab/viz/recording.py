@@ -1,7 +1,7 @@
 """An episode as a Rerun recording, with a layout that opens well."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,10 +10,11 @@ import rerun as rr
 from jaxtyping import Bool, UInt8
 
 from flowlab.geometry.transforms import rotation_from_6d
-from flowlab.records import Episode
+from flowlab.records import Episode, Foreseen
 from flowlab.storage.files import temporary_path
-from flowlab.viz.colours import SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
+from flowlab.viz.colours import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
 from flowlab.viz.facts import describe
+from flowlab.viz.forecasts import EXPECTED_M, MOVES_M, Forecast, errors, forecasts
 from flowlab.viz.layout import CAMERA, DEPTH, RGB, layout, size
 from flowlab.viz.upright import in_camera_frame
 
@@ -23,24 +24,40 @@ _STILL = 1e-3
 """A point that moves less than this over a whole trail [m] gets none."""
 _HIDDEN_LIGHT = 0.4
 """Brightness of what the camera does not see, against 1 for what it sees."""
+_LEGEND = (
+    "The bright yellow lines, which end in dots, are where the policy expected the points to go when it made its last "
+    f"plan, step by step; points that it expected to stay within {1000 * EXPECTED_M:.0f} mm have none. The flow error "
+    "is how far from there the points truly were at each step, on average over those that move more than "
+    f"{1000 * MOVES_M:.0f} mm under the plan."
+)
 
 
-def write_recording(episode: Episode, path: Path, *, name: str, about: str = "") -> None:
+def write_recording(
+    episode: Episode, path: Path, *, name: str, about: str = "", foreseen: Foreseen | None = None
+) -> None:
     """Write a ``.rrd`` that opens in any Rerun viewer. ``path`` is either absent, as before, or whole.
 
     ``name`` is what the viewer calls the recording; ``about`` is Markdown put above the facts in its info panel.
+    What a policy has ``foreseen`` is drawn from the step of each plan to that of the next.
     All positions are metres in the world frame of the episode.
     """
     recording = rr.RecordingStream("flowlab")
+    plans = [] if foreseen is None else forecasts(episode, foreseen)
+    off = list(errors(plans))
     temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with _strict():
-            recording.save(temporary, default_blueprint=layout(episode))
+            recording.save(temporary, default_blueprint=layout(episode, flow_error=bool(off)))
             recording.send_recording_name(name)
             for send in (_send_cloud, _send_tracks, _send_camera, _send_pictures, _send_object, _send_scalars):
                 send(recording, episode)
-            _send_info(recording, f"{about}\n\n{describe(episode)}")
+            if plans:
+                _send_forecasts(recording, episode, plans)
+            if off:
+                _send_flow_error(recording, episode, off)
+            legend = f"\n\n{_LEGEND}" if plans else ""
+            _send_info(recording, f"{about}\n\n{describe(episode)}{legend}")
             recording.disconnect()  # writes what is buffered, and the footer
         os.replace(temporary, path)
     finally:
@@ -59,9 +76,10 @@ def _strict() -> Iterator[None]:
         rr.set_strict_mode(before)
 
 
-def _times(episode: Episode) -> list[rr.TimeColumn]:
-    steps = np.arange(len(episode))
-    return [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("time", duration=episode.time_s)]
+def _times(episode: Episode, steps: Sequence[int] | None = None) -> list[rr.TimeColumn]:
+    """The columns of some steps, or of all."""
+    rows = np.arange(len(episode)) if steps is None else np.array(steps)
+    return [rr.TimeColumn("step", sequence=rows), rr.TimeColumn("time", duration=episode.time_s[rows])]
 
 
 def _send_info(recording: rr.RecordingStream, text: str) -> None:
@@ -96,6 +114,20 @@ def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
 def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
     """The colours at every step, darker where the camera does not see the point."""
     return (rgb * np.where(visible, 1.0, _HIDDEN_LIGHT)[..., None]).astype(np.uint8)
+
+
+def _send_forecasts(recording: rr.RecordingStream, episode: Episode, plans: Sequence[Forecast]) -> None:
+    """The paths that each plan expects; one that expects none clears those of the plan before."""
+    drawn = [plan.expected_world[:, plan.stirs].swapaxes(0, 1) for plan in plans]
+    times = _times(episode, [plan.step for plan in plans])
+    counts = [len(paths) for paths in drawn]
+    strips = rr.LineStrips3D.columns(strips=[path for paths in drawn for path in paths])
+    ends = rr.Points3D.columns(positions=np.concatenate([paths[:, -1] for paths in drawn]))
+    recording.send_columns("/world/predicted/paths", times, strips.partition(counts))
+    recording.send_columns("/world/predicted/ends", times, ends.partition(counts))
+    thin, small = 0.0008 * size(episode), 0.0022 * size(episode)
+    recording.log("/world/predicted/paths", rr.LineStrips3D.from_fields(radii=thin, colors=PREDICTED_RGB), static=True)
+    recording.log("/world/predicted/ends", rr.Points3D.from_fields(radii=small, colors=PREDICTED_RGB), static=True)
 
 
 def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
@@ -156,9 +188,22 @@ def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
             _send_line(recording, episode, f"quality/{key}", values, name=name, colour=colour)
 
 
+def _send_flow_error(recording: rr.RecordingStream, episode: Episode, off: Sequence[tuple[int, float]]) -> None:
+    steps, error = zip(*off, strict=True)
+    values, name = 1000 * np.array(error), "flow error [mm]"
+    _send_line(recording, episode, "flow_error", values, name=name, colour=PREDICTED_RGB, steps=steps)
+
+
 def _send_line(
-    recording: rr.RecordingStream, episode: Episode, key: str, values: np.ndarray, *, name: str, colour: tuple[int, ...]
+    recording: rr.RecordingStream,
+    episode: Episode,
+    key: str,
+    values: np.ndarray,
+    *,
+    name: str,
+    colour: tuple[int, ...],
+    steps: Sequence[int] | None = None,
 ) -> None:
-    """One line of a plot: a value per step."""
+    """One line of a plot: a value for each of some steps, or of all."""
     recording.log(f"/scalars/{key}", rr.SeriesLines(names=name, colors=colour, widths=1.5), static=True)
-    recording.send_columns(f"/scalars/{key}", _times(episode), rr.Scalars.columns(scalars=values))
+    recording.send_columns(f"/scalars/{key}", _times(episode, steps), rr.Scalars.columns(scalars=values))

@@ -12,7 +12,7 @@ from matplotlib.text import Text
 from matplotlib.typing import ColorType
 
 from flowlab.records import Episode
-from flowlab.viz.colours import SIGMA_LIMIT, role_rgb, sigma_rgb
+from flowlab.viz.colours import PREDICTED_RGB, SIGMA_LIMIT, role_rgb, sigma_rgb
 from flowlab.viz.facts import role_name, sigma_summary, tracker_name
 
 _DPI = 128
@@ -28,7 +28,7 @@ class Strip:
     """Draws the strip of every step. Along its top runs how far the film is, in the colour of that step's
     median stated error where there is one."""
 
-    def __init__(self, episode: Episode, width: int, title: str, note: str) -> None:
+    def __init__(self, episode: Episode, width: int, title: str, note: str, *, predicted: bool = False) -> None:
         self._episode = episode
         self._scale = max(1.0, width / _WIDTH)
         self._width = width / self._scale
@@ -42,7 +42,7 @@ class Strip:
             self._write(self._width - 14, 46, f"tracker {tracker_name(episode)}", size=11, color=_QUIET, ha="right")
         for k, line in enumerate(lines):
             self._write(14, _HEIGHT + 6 + _NOTE_HEIGHT * k, line, size=12, color=_ALARM)
-        self._draw_marks()
+        self._draw_marks(predicted)
         self._draw_colours()
         self._step = self._write(self._width - 14, 24, "", size=12, ha="right")
         self._state = self._write(14, 46, "", size=12, color=_QUIET)
@@ -72,8 +72,8 @@ class Strip:
         points = size * self._scale * 72 / _DPI
         return self._figure.text(*place, text, fontsize=points, color=color, va="center", **style)
 
-    def _draw_marks(self) -> None:
-        """The legend of the marks: disc, ring, cross."""
+    def _draw_marks(self, predicted: bool) -> None:
+        """The legend of the marks: disc, ring, cross; and the line of a predicted path."""
         marks = [("in sight", "o", _INK), ("out of sight", "o", "none")]
         if self._episode.tracks.quality is not None:
             marks.append(("filled in", "x", _INK))
@@ -82,6 +82,9 @@ class Strip:
             self._dot(x, marker, face, _INK)
             self._write(x + 10, 69, name, size=11, color=_QUIET)
             x += 24 + 6.2 * len(name)
+        if predicted:
+            self._draw_path(x - 6)
+            self._write(x + 24, 69, "predicted", size=11, color=_QUIET)
 
     def _draw_colours(self) -> None:
         """The legend of the colours: the scale of stated errors, or the roles."""
@@ -108,6 +111,15 @@ class Strip:
             markeredgecolor=edge, markeredgewidth=1.5 * points,
         )  # fmt: skip
         self._figure.add_artist(mark)
+
+    def _draw_path(self, x: float) -> None:
+        """A line that ends in a dot."""
+        y, rgb, points = 1 - 69 / self._height, tuple(np.array(PREDICTED_RGB) / 255), self._scale * 72 / _DPI
+        line = Line2D(
+            [x / self._width, (x + 20) / self._width], [y, y], color=rgb, linewidth=1.6 * points, marker="o",
+            markersize=5.5 * points, markevery=[1], markeredgewidth=0,
+        )  # fmt: skip
+        self._figure.add_artist(line)
 
     def _draw_progress(self, width: int) -> UInt8[np.ndarray, "h W 3"]:
         quality, count = self._episode.tracks.quality, self._episode.queries.count

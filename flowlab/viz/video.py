@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from flowlab.errors import DataError
-from flowlab.records import Episode
+from flowlab.records import Episode, Foreseen
 from flowlab.storage.files import temporary_path
 from flowlab.viz.overlay import Overlay
 from flowlab.viz.strip import Strip
@@ -22,18 +22,27 @@ _BT709 = 1
 
 
 def write_video(
-    episode: Episode, path: Path, *, fps: float | None = None, trail_s: float = 0.5, title: str = "", note: str = ""
+    episode: Episode,
+    path: Path,
+    *,
+    fps: float | None = None,
+    trail_s: float = 0.5,
+    title: str = "",
+    note: str = "",
+    foreseen: Foreseen | None = None,
 ) -> None:
     """Write an H.264 ``.mp4`` that browsers play, a frame per step. ``path`` is either absent, as before, or whole.
 
     Every query point is drawn where its track is in the colour picture, or in the depth picture where there is
     no colour; by default in real time, with trails over the last half second. ``title`` is said instead of task
-    and seed; ``note`` stands below, in red. Raises :class:`DataError` where the episode has no pictures.
+    and seed; ``note`` stands below, in red. The paths that a policy has ``foreseen`` are drawn from the step of each
+    plan to that of the next. Raises :class:`DataError` where the episode has no pictures.
     """
     pictures = Pictures(episode)
     rate = Fraction(mean_fps(episode) if fps is None else fps).limit_denominator(1000)
-    overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))))
-    strip = Strip(episode, pictures.scale * episode.camera.width, title or f"{episode.task}, seed {episode.seed}", note)
+    overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))), foreseen)
+    name, width = title or f"{episode.task}, seed {episode.seed}", pictures.scale * episode.camera.width
+    strip = Strip(episode, width, name, note, predicted=foreseen is not None)
     temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
