@@ -10,13 +10,16 @@ WORKSPACE := {low: [-0.5, 0.25, -0.2], high: [0.5, 0.97, 0.8]}
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-demo: .venv/run ## real simulation to a picture, and to a policy; then an episode recorded, labelled from pictures, graded
+demo: .venv/run ## real simulation to a picture, and to a policy that is tried; then an episode recorded, labelled from pictures, graded
 	$(BIN)/flowlab extract-sim $(TASKS) --episodes 3 --set write.depth=true --out demo/data
 	$(BIN)/flowlab validate demo/data
 	$(BIN)/flowlab viz demo/data --task hammer --png demo/hammer.png --save demo/hammer.rrd
 	@echo "The picture is demo/hammer.png; open the recording with: $(BIN)/rerun demo/hammer.rrd"
 	rm -rf demo/run
 	$(BIN)/flowlab train demo/data --policy fdp --minutes 1 --out demo/run
+	$(BIN)/flowlab eval demo/run --episodes 2 --seeds 0 --out demo/report
+	$(BIN)/flowlab viz demo/run --task hammer --png demo/predicted.png --save demo/predicted.rrd
+	@echo "How often the policy succeeds: demo/report/report.html; the motion it foresees: demo/predicted.png"
 	@$(MAKE) --no-print-directory demo-real
 
 demo-real: .venv/run .venv/opengl ## the second half of the demo: what a camera would have seen, labelled blind

@@ -51,7 +51,7 @@ class ProgressBar:
             console=console,
             disable=quiet or not console.is_terminal,
         )
-        self._task = self._bar.add_task("extracting", total=None)
+        self._task = self._bar.add_task("starting", total=None)
         self._start = self._last_line = time.monotonic()
         self._done_at_start: int | None = None
 

@@ -1,68 +1,191 @@
-"""A policy acts in simulation, seeing what its own Observer makes of the scene."""
+"""Policies act in simulation: several episodes at a time, so that one plan serves them all."""
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
+from flowlab.errors import DataError
+from flowlab.evaluation.actor import Actor, together
+from flowlab.evaluation.flow import flow_error
+from flowlab.evaluation.trials import Outcome, Trial
 from flowlab.learning.batches import Context
-from flowlab.learning.policy import Policy
-from flowlab.perception.observer import Observer, ObserverSettings
-from flowlab.perception.queries import QuerySettings, sample_queries
-from flowlab.records import Observation
-from flowlab.sim.rollout import Studio
+from flowlab.learning.policy import Plan, PolicyNetwork
+from flowlab.records import Queries
+from flowlab.sim.environment import SceneSettings
+from flowlab.sim.rollout import Live, Rollout, Studio
 
 MAX_STEPS = 200
 """DP3's and 3D FDP's limit."""
+LANES = 4
+"""Windows of every plan. More hardly cost less each (on a CPU, the encoder's products are large enough), and each
+needs a simulation of its own."""
+_LAST_LOOKED_AT = 2
+"""Of the executed steps of a plan, DP3's runner keeps the success of so many."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """How one episode went."""
+class Attempt:
+    """An episode that a policy has been through."""
 
-    task: str
-    seed: int
-    success: bool
-    """Whether the task counted as solved after any step."""
-    steps: int
-    """Until it did, or all of them."""
+    outcome: Outcome
+    rollout: Rollout
+    queries: Queries | None
+    """The points whose motion was predicted."""
+    predicted: tuple[tuple[int, Float32[np.ndarray, "K M 3"]], ...]
+    """The step every plan was made at, and the flow [m] it foresaw from then on, action by action; more of them than
+    are executed."""
 
 
-def roll_out(studio: Studio, policy: Policy, seed: int, max_steps: int = MAX_STEPS) -> Outcome:
-    """Let a policy try the layout of ``seed``; the same seed gives the same outcome.
+class Stage:
+    """Simulations of one task, one for each lane, made as they are needed and used again."""
 
-    Only the frames that a plan looks at are rendered.
+    def __init__(self, task: str, scene: SceneSettings) -> None:
+        self.task, self.scene = task, scene
+        self._studios: dict[int, Studio] = {}
+
+    def studio(self, lane: int) -> Studio:
+        """That of a lane."""
+        if lane not in self._studios:
+            self._studios[lane] = Studio(self.task, self.scene)
+        return self._studios[lane]
+
+
+def roll_out(
+    policy: PolicyNetwork,
+    stage: Stage,
+    trials: Sequence[Trial],
+    *,
+    executed: int | None = None,
+    max_steps: int = MAX_STEPS,
+    look_always: bool = False,
+) -> Iterator[Attempt]:
+    """Try episodes of one task, and hand out each as it ends.
+
+    What comes out of a trial depends on the policy and the trial only, bit for bit, whatever else is tried beside it:
+    every plan has ``LANES`` windows, a trial's is always the same of them (its number modulo ``LANES``), and its noise
+    is its own. Only frames that a plan looks at are taken, but with ``look_always``, which changes nothing.
     """
-    spec, sim = policy.spec, studio.simulation
-    s = spec.settings
-    observer = Observer(ObserverSettings.model_validate(spec.observer), sim.task.name)
-    generator = torch.Generator().manual_seed(seed)
-    sim.reset(seed)
-    live = studio.live()
-    cloud = observer.cloud(live.frame())
-    queries = torch.zeros(1, 0, 3)
-    if s.policy == "fdp":
-        chosen = sample_queries(cloud, QuerySettings.model_validate(spec.queries))
-        queries = torch.from_numpy(chosen.xyz_world)[None]
-    task = torch.tensor([spec.tasks.index(sim.task.name)])
-    first = observer.sample(cloud), sim.state
-    seen: deque[tuple[Observation, np.ndarray]] = deque([first] * s.history, s.history)
-    step = 0
-    while step < max_steps:
-        context = Context(
-            points=torch.from_numpy(np.stack([o.points_world[: s.encoder.points] for o, _ in seen])),
-            state=torch.from_numpy(np.stack([state for _, state in seen])),
-            observed=torch.arange(s.history)[None],
-            queries=queries,
-            task=task,
-        )
-        plan = policy.plan(context, generator).action[0, s.history - 1 :][: s.executed].numpy()
-        for k, action in enumerate(plan):
-            success = sim.step(np.clip(action, -1, 1))
-            step += 1
-            if success or step == max_steps:
-                return Outcome(sim.task.name, seed, success, step)
-            if k >= len(plan) - s.history:
-                seen.append((observer.observe(live.frame()), sim.state))
-    raise AssertionError("the last step returns")
+    lanes = [_Lane(k, policy, stage, executed, max_steps, look_always) for k in range(LANES)]
+    for trial in trials:
+        lanes[trial.episode % LANES].waiting.append(trial)
+    device = next(policy.parameters()).device
+    while ready := [lane for lane in lanes if lane.ready()]:
+        spare = ready[0].context()
+        whole = together([lane.context() if lane in ready else spare for lane in lanes]).to(device)
+        plan = policy.plan(whole, [lane.noise for lane in lanes])
+        for lane in ready:
+            attempt = lane.go_on(plan)
+            if attempt is not None:
+                yield attempt
+
+
+@dataclass
+class _UnderWay:
+    """An episode that has begun."""
+
+    trial: Trial
+    live: Live
+    actor: Actor
+    success_dp3: bool = False
+    note: str = ""
+    predicted: list[tuple[int, Float32[np.ndarray, "K M 3"]]] = field(default_factory=list)
+
+
+class _Lane:
+    """One window of every plan: tries its episodes one after the other."""
+
+    def __init__(
+        self,
+        index: int,
+        policy: PolicyNetwork,
+        stage: Stage,
+        executed: int | None,
+        max_steps: int,
+        look_always: bool,
+    ) -> None:
+        self._index, self._policy, self._stage = index, policy, stage
+        self._executed, self._max_steps, self._look_always = executed, max_steps, look_always
+        self.waiting: deque[Trial] = deque()
+        self.under_way: _UnderWay | None = None
+        self.noise = torch.Generator()
+
+    def ready(self) -> bool:
+        """Begin the next episode if none is under way; whether one is."""
+        if self.under_way is None and self.waiting:
+            trial = self.waiting.popleft()
+            actor = Actor(self._policy.spec, trial.task, trial.layout, self._executed)
+            self.noise = actor.noise
+            self.under_way = _UnderWay(trial, self._stage.studio(self._index).begin(trial.layout), actor)
+            self._look()
+        return self.under_way is not None
+
+    def context(self) -> Context:
+        """What a plan for the episode under way is decided on."""
+        assert self.under_way is not None
+        return self.under_way.actor.context()
+
+    def go_on(self, plan: Plan) -> Attempt | None:
+        """Execute this lane's part of a plan; the attempt if it has come to its end."""
+        episode = self.under_way
+        assert episode is not None
+        live, actor = episode.live, episode.actor
+        began = len(live.success)
+        if plan.flow is not None:
+            now = actor.spec.settings.history - 1
+            flow = plan.flow[self._index, now:].cpu().numpy()
+            episode.predicted.append((began, flow))
+        actor.follow(plan, self._index)
+        while not (over := self._is_over(episode)):
+            live.step(np.clip(actor.act(), -1, 1))
+            if actor.plan_is_due:
+                episode.success_dp3 |= any(live.success[began:][-_LAST_LOOKED_AT:])
+            self._look()
+            if actor.plan_is_due:
+                over = self._is_over(episode)
+                break
+        if not over:
+            return None
+        self.under_way = None
+        return _finished(episode)
+
+    def _look(self) -> None:
+        assert self.under_way is not None
+        episode, live = self.under_way, self.under_way.live
+        if not (episode.actor.looks or self._look_always):
+            return
+        frame = live.frame()
+        if episode.actor.looks:
+            try:
+                episode.actor.see(frame, live.simulation.state)
+            except DataError as error:
+                episode.note = str(error)
+
+    def _is_over(self, episode: _UnderWay) -> bool:
+        """Once solved by both readings, out of steps, or broken down."""
+        live = episode.live
+        if live.unstable:
+            episode.note = "the physics became unstable"
+        solved = any(live.success) and episode.success_dp3
+        return solved or len(live.success) >= self._max_steps or bool(episode.note)
+
+
+def _finished(episode: _UnderWay) -> Attempt:
+    trial, live, queries = episode.trial, episode.live, episode.actor.queries
+    rollout, predicted = live.rollout(), tuple(episode.predicted)
+    solved = bool(any(live.success)) and not episode.note
+    outcome = Outcome(
+        task=trial.task,
+        seed=trial.seed,
+        episode=trial.episode,
+        layout=trial.layout,
+        success=solved,
+        success_dp3=solved and episode.success_dp3,
+        steps=live.success.index(True) + 1 if solved else len(live.success),
+        note=episode.note,
+        flow=None if queries is None else flow_error(rollout, queries, predicted, episode.actor.executed),
+    )
+    return Attempt(outcome, rollout, queries, predicted)

@@ -1,0 +1,48 @@
+"""``flowlab report``."""
+
+from pathlib import Path
+
+import click
+
+from flowlab.cli.console import print_json, print_table
+from flowlab.cli.results import print_results
+from flowlab.errors import UsageError
+
+
+@click.command()
+@click.argument("sources", nargs=-1, required=True, metavar="SOURCE...", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write  [SOURCE, if it is an experiment].")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def report(sources: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
+    """Write a report of evaluations: report.html, report.json, CSV.
+
+    \b
+      flowlab report results/hard
+      flowlab report runs/push-fdp runs/push-dp3 --out results/push
+      flowlab report trials.csv --out results/robot
+
+    A SOURCE is the folder of a bench, a run that `flowlab eval` has evaluated, or a CSV file of trials on a robot that
+    somebody scored, with the columns policy, task, trial, success.
+    """
+    from flowlab.evaluation.collect import gather
+    from flowlab.evaluation.report import write_report
+    from flowlab.evaluation.scored import read_scored, scored_rows
+    from flowlab.evaluation.summary import summarise
+
+    tables = [source for source in sources if source.suffix == ".csv"]
+    folders = [source for source in sources if source.suffix != ".csv"]
+    if out is None:
+        if len(sources) != 1 or tables:
+            raise UsageError("--out: say where to write the report, as in --out results/robot")
+        out = sources[0]
+    scored = [trial for table in tables for trial in read_scored(table)]
+    results = gather(folders)
+    write_report(out, results, scored=scored)
+    if as_json:
+        print_json(summarise(results).model_dump(mode="json"))
+        return
+    if results:
+        print_results(results)
+    for title, columns, rows in scored_rows(scored) if scored else []:
+        print_table(columns, rows, title)
+    click.echo(f"{out / 'report.html'}, with report.json, report.csv and episodes.csv beside it")

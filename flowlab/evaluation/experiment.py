@@ -1,0 +1,259 @@
+"""A whole experiment from one recipe: datasets, policies, their evaluations; unit by unit, each done once."""
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
+
+from flowlab.config import Settings, explain, read_named
+from flowlab.errors import DataError, UnfinishedError, UsageError, unknown
+from flowlab.evaluation.collect import describe_training
+from flowlab.evaluation.evaluate import Subject, find_checkpoints, try_missing
+from flowlab.evaluation.results import UNITS, Result, read_result, write_result
+from flowlab.evaluation.trials import trials
+from flowlab.learning import runs
+from flowlab.learning.checkpoint import RUN, newest_checkpoint, read_run, read_trained, step_of
+from flowlab.learning.settings import POLICIES, TrainSettings, load_settings
+from flowlab.pipeline.engine import LocalEngine, StartEngine
+from flowlab.pipeline.recipe import load_recipe
+from flowlab.pipeline.run import extract
+from flowlab.sim.tasks import GROUPS, select_tasks
+from flowlab.storage.manifest import differences
+
+RUNS, DATA = "runs", "data"
+"""Folders of an experiment beside that of its results, of which alone a finished unit has need."""
+
+
+class Variant(Settings):
+    """A policy with other settings."""
+
+    name: str
+    """What is added to the policy's name."""
+    tasks: tuple[str, ...]
+    """Tasks or groups; those that are not among the experiment's are left out."""
+    set: tuple[str, ...]
+    """Settings of training, as for ``flowlab train --set``."""
+    policy: str = "fdp"
+
+
+class ExperimentRecipe(Settings):
+    """What is compared with what, and how long."""
+
+    name: str
+    description: str = ""
+    tasks: tuple[str, ...]
+    """Tasks or groups."""
+    policies: tuple[str, ...]
+    demonstrations: PositiveInt
+    """Trained on, of each task; one more is held out."""
+    recipe: str
+    """Of the datasets."""
+    query_points: PositiveInt
+    """In the datasets; policies take as many as they want of them."""
+    profile: str
+    """Of training."""
+    minutes: PositiveFloat
+    """Of training: CPU time of one thread, and on a GPU by the clock."""
+    set: tuple[str, ...] = ()
+    """Settings of training for all, as for ``flowlab train --set``."""
+    seeds: tuple[int, ...]
+    episodes: PositiveInt
+    """Of each seed."""
+    curve_episodes: int = Field(ge=0)
+    """Of the first seed, for every checkpoint but the last; 0 draws no learning curves."""
+    variants: tuple[Variant, ...] = ()
+    device: str = "auto"
+
+
+class Unit(Settings):
+    """One policy: what a worker trains and evaluates."""
+
+    name: str
+    label: str
+    task: str
+    dataset: str
+    """Folder below the experiment's."""
+    settings: TrainSettings
+
+
+def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
+    """A recipe by file, or by the name of one that comes with flowlab, with other values for some of its keys.
+
+    Raises :class:`UsageError` naming what is missing, unknown or wrong.
+    """
+    try:
+        values = yaml.safe_load(read_named("experiment", name, "bench"))
+    except yaml.YAMLError as error:
+        raise UsageError(f"experiment {name}: not valid YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise UsageError(f"experiment {name}: is a mapping with the keys {', '.join(ExperimentRecipe.model_fields)}")
+    try:
+        return ExperimentRecipe.model_validate({**values, **changes})
+    except ValidationError as error:
+        raise UsageError(f"experiment {name}: {explain(error, ExperimentRecipe)}") from error
+
+
+def with_variants(recipe: ExperimentRecipe, names: Sequence[str]) -> ExperimentRecipe:
+    """Only these of the variants."""
+    known = {v.name: v for v in recipe.variants}
+    for name in names:
+        if name not in known:
+            raise unknown("variant of this recipe", name, known)
+    return recipe.model_copy(update={"variants": tuple(known[name] for name in names)})
+
+
+def plan(recipe: ExperimentRecipe) -> list[Unit]:
+    """Every unit, the policies' own before the variants. Raises :class:`UsageError` where a name does not exist."""
+    for name in recipe.policies:
+        if name not in POLICIES:
+            raise unknown("policy", name, POLICIES)
+    tasks = _tasks(recipe.tasks)
+    units = [_unit(recipe, task, policy) for task in tasks for policy in recipe.policies]
+    for variant in recipe.variants:
+        units += [_unit(recipe, t, variant.policy, variant) for t in _tasks(variant.tasks) if t in tasks]
+    return units
+
+
+def run_experiment(
+    recipe: ExperimentRecipe,
+    out: Path,
+    workers: int,
+    report: Callable[[Sequence[Result], int], None] = lambda done, of: None,
+) -> list[Result]:
+    """Do what has not been done yet, and return all results.
+
+    A unit is done once its JSON is in ``out/units``; runs and datasets are needed only until then. ``report`` is told
+    the results so far, and how many there will be. Raises :class:`DataError` where a result that is there was made
+    with other settings, and :class:`UnfinishedError` where units failed.
+    """
+    units = plan(recipe)
+    known = {u.name: _known(out, u) for u in units}
+    todo = [u for u in units if known[u.name] is None]
+    _extract(recipe, todo, out, workers)
+
+    def results() -> list[Result]:
+        return [r for u in units if (r := known[u.name]) is not None]
+
+    report(results(), len(units))
+    failures = []
+    start: StartEngine[Unit, str] = partial(LocalEngine, workers=workers, imports=[__name__])
+    with start(partial(do_unit, recipe, out)) as engine:
+        for unit in todo:
+            engine.submit(unit)
+        for _ in todo:
+            ended = engine.next_outcome()
+            if ended.receipt is None:
+                failures.append(f"{ended.unit.name}: {ended.failure.strip().splitlines()[-1]}")
+                continue
+            known[ended.receipt] = read_result(_place(out, ended.receipt))
+            report(results(), len(units))
+    if failures:
+        raise UnfinishedError(f"{len(failures)} units failed, the first {failures[0]}; the same command tries again")
+    return results()
+
+
+def do_unit(recipe: ExperimentRecipe, out: Path, unit: Unit) -> str:
+    """A worker's part: train, evaluate, keep the result, and say its name."""
+    folder = out / RUNS / unit.name
+    _train(out / unit.dataset, folder, unit.settings, recipe.device)
+    *earlier, last = find_checkpoints(folder)
+    whole = trials([unit.task], recipe.seeds, recipe.episodes)
+    some = trials([unit.task], recipe.seeds[:1], recipe.curve_episodes) if recipe.curve_episodes else []
+    wanted: list[tuple[Subject, Any]] = [*((s, some) for s in earlier if some), (last, whole)]
+    for subject, of_subject in wanted:
+        try_missing(subject, of_subject)
+    result = Result(
+        name=unit.name,
+        label=unit.label,
+        tasks=(unit.task,),
+        training=describe_training(folder),
+        evaluations=tuple(subject.evaluation(of_subject) for subject, of_subject in wanted),
+    )
+    write_result(_place(out, unit.name), result)
+    return unit.name
+
+
+def _train(data: Path, folder: Path, settings: TrainSettings, device: str) -> None:
+    """Train to the end, from wherever an earlier try has come to."""
+    if not (folder / RUN).exists():
+        trainer = runs.prepare(data, folder, settings, runs.Machine(device=device))
+    else:
+        _check_same(read_trained(folder).policy.settings, settings, folder)
+        if _finished(folder):
+            return
+        trainer = runs.resume(folder)
+    runs.run(trainer, lambda _: None)
+
+
+def _finished(folder: Path) -> bool:
+    try:
+        return step_of(newest_checkpoint(folder)) >= read_run(folder).steps
+    except DataError:
+        return False
+
+
+def _extract(recipe: ExperimentRecipe, todo: Sequence[Unit], out: Path, workers: int) -> None:
+    """Make the datasets that units need: a moment's work beside training."""
+    engine = partial(LocalEngine, workers=workers)
+    for folder, unit in {u.dataset: u for u in todo}.items():
+        sampling = unit.settings.motion.sampling
+        changes = [
+            f"episodes={recipe.demonstrations + 1}",
+            f"queries.points={recipe.query_points}",
+            f"queries.sampling={sampling}",
+        ]
+        extract(load_recipe(recipe.recipe, changes), (unit.task,), out / folder, start_engine=engine)
+
+
+def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: Variant | None = None) -> Unit:
+    label = policy if variant is None else f"{policy}-{variant.name}"
+    changes = [
+        f"data.demonstrations={recipe.demonstrations}",
+        "data.held_out=1",
+        f"run.minutes={recipe.minutes}",
+        "run.steps=null",
+        *recipe.set,
+        *(variant.set if variant else ()),
+    ]
+    settings = load_settings(recipe.profile, policy, changes)
+    sampling = settings.motion.sampling
+    return Unit(
+        name=f"{task}-{label}",
+        label=label,
+        task=task,
+        dataset=f"{DATA}/{task}" + ("" if sampling == "scene" else f"-{sampling}"),
+        settings=settings,
+    )
+
+
+def _tasks(names: Sequence[str]) -> tuple[str, ...]:
+    return select_tasks([n for n in names if n not in GROUPS], [n for n in names if n in GROUPS])
+
+
+def _place(out: Path, name: str) -> Path:
+    return out / UNITS / f"{name}.json"
+
+
+def _known(out: Path, unit: Unit) -> Result | None:
+    """The result of a unit, if it is there already."""
+    path = _place(out, unit.name)
+    if not path.exists():
+        return None
+    result = read_result(path)
+    _check_same(result.training.settings, unit.settings, path)
+    return result
+
+
+def _check_same(found: Any, wanted: TrainSettings, where: Path) -> None:
+    """Refuse to mix what was made with other settings."""
+    mine = json.loads(wanted.model_dump_json())
+    theirs = found if isinstance(found, dict) else json.loads(found.model_dump_json())
+    if lines := list(differences(theirs, mine, "settings")):
+        raise DataError(
+            f"{where}: was made with other settings; choose another --out, or delete it to make it anew:\n  "
+            + "\n  ".join(line.replace("the dataset has", "it has").replace("this run", "the recipe") for line in lines)
+        )

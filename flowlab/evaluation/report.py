@@ -1,0 +1,276 @@
+"""A report of evaluations: one page to read, and the numbers behind it as JSON and CSV."""
+
+import base64
+import csv
+import io
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from jinja2 import Environment, StrictUndefined
+
+from flowlab import __version__
+from flowlab.errors import DataError
+from flowlab.evaluation.paper import CURVE_TASKS, beside, differences, paper_share
+from flowlab.evaluation.results import Result, Training
+from flowlab.evaluation.statistics import Share
+from flowlab.evaluation.summary import ALL, Summary, summarise, tell_apart
+from flowlab.evaluation.trials import FlowError
+from flowlab.storage.files import write_json, write_whole
+from flowlab.viz.success import Curve, Foreseen, Mark, Panel, draw_curves, draw_flow, draw_success, policy_colours
+
+if TYPE_CHECKING:
+    from flowlab.evaluation.scored import ScoredTrial
+
+FIGURES = "figures"
+_BASELINES = ("_zero", "_hold", "_constant")
+"""Endings of held-out errors of what needs no training; the first is enough here."""
+_Rows = Iterable[Sequence[object]]
+
+
+def write_report(
+    folder: Path, results: Sequence[Result], *, films: Sequence[Path] = (), scored: Sequence["ScoredTrial"] = ()
+) -> None:
+    """Write ``report.html``, which holds its figures, and beside it ``report.json``, ``report.csv``, ``episodes.csv``
+    and the figures as PNG. Each file is replaced in one step; the same results, in any order, give the same bytes.
+
+    ``films`` are linked from the page. ``scored`` are trials on a robot that somebody scored. Raises
+    :class:`DataError` where there are neither results nor such trials.
+    """
+    if not results and not scored:
+        raise DataError("there is nothing to report; evaluate a policy first, with: flowlab eval RUN")
+    summary = summarise(results)
+    by_hand = _scored_tables(scored)
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = draw_figures(folder / FIGURES, summary)
+    values = {
+        "flowlab": __version__,
+        "summary": summary.model_dump(mode="json"),
+        "paper": [table.model_dump(mode="json") for table in beside(summary)],
+        "scored": [{"title": title, "columns": columns, "rows": rows} for title, columns, rows in by_hand],
+    }
+    write_json(folder / "report.json", values)
+    write_whole(folder / "report.csv", _csv(_REPORT_COLUMNS, _report_rows(summary)))
+    write_whole(folder / "episodes.csv", _csv(_EPISODE_COLUMNS, _episode_rows(results)))
+    links = [(film.name, quote(Path(os.path.relpath(film, folder)).as_posix())) for film in films]
+    write_whole(folder / "report.html", render(summary, figures, links, by_hand))
+
+
+def draw_figures(folder: Path, summary: Summary) -> dict[str, Path]:
+    """Draw what there is to draw, by the name of the figure; figures of an earlier report go."""
+    success, curves, flow = _panels(summary), _curves(summary), _foreseen(summary)
+    paths = {name: folder / f"{name}.png" for name in ("success", "curves", "flow")}
+    if success:
+        draw_success(success, summary.labels, paths["success"])
+    if curves:
+        draw_curves(curves, summary.labels, paths["curves"])
+    if flow:
+        draw_flow(flow, summary.labels, paths["flow"])
+    drawn = {"success": bool(success), "curves": bool(curves), "flow": bool(flow)}
+    for name, path in paths.items():
+        if not drawn[name]:
+            path.unlink(missing_ok=True)
+    return {name: path for name, path in paths.items() if drawn[name]}
+
+
+def render(
+    summary: Summary,
+    figures: Mapping[str, Path],
+    films: Sequence[tuple[str, str]] = (),
+    scored: Sequence[tuple[str, Sequence[str], _Rows]] = (),
+) -> str:
+    """The page, which needs no other file and no network. ``films`` are names and relative addresses."""
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    environment.filters |= {"percent": _percent, "p": _p_value, "number": _number, "short": _short}
+    tables = beside(summary)
+    template = environment.from_string(files("flowlab.evaluation").joinpath("report.html.j2").read_text("utf-8"))
+    return template.render(
+        s=summary,
+        ALL=ALL,
+        success=success_rows(summary),
+        held_out=held_out(summary),
+        machines=sorted({_machine(f.training) for f in summary.training}),
+        colours=policy_colours(summary.labels),
+        paper=tables,
+        curve_tasks=CURVE_TASKS,
+        differences=differences(summary) if tables else [],
+        figures={name: base64.b64encode(path.read_bytes()).decode() for name, path in figures.items()},
+        films=films,
+        scored=scored,
+        version=__version__,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A policy's success in a row of the page's table."""
+
+    share: float
+    """Of a group, the mean over its tasks."""
+    episodes: Share
+    note: str
+    best: bool
+    """Highest of the row, among those of the same tasks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A task, or the group that the tasks above it belong to."""
+
+    name: str
+    sums_up: bool
+    cells: tuple[Cell | None, ...]
+    """By policy."""
+
+
+def success_rows(summary: Summary) -> list[Row]:
+    """Policies side by side: every task, after them their group where they are several, in the end all."""
+    rows = []
+    for group in dict.fromkeys(g.group for g in summary.groups):
+        of_group = {g.label: g for g in summary.groups if g.group == group}
+        tasks = list(dict.fromkeys(x.task for x in summary.successes if x.group == group))
+        for task in tasks:
+            on_task = {x.label: x.success for x in summary.successes if x.task == task}
+            shares = {label: (s.share, s, f"n {s.n}") for label, s in on_task.items()}
+            rows.append(_row(summary, task, False, shares, set(shares)))
+        if len(tasks) > 1 or (group == ALL and len(summary.tasks) > 1):
+            most = max((g.tasks for g in of_group.values()), key=len)
+            shares = {x: (g.task_mean, g.success, f"{len(g.tasks)} of {g.of} tasks") for x, g in of_group.items()}
+            rows.append(_row(summary, group, True, shares, {x for x, g in of_group.items() if g.tasks == most}))
+    return rows
+
+
+def _row(
+    summary: Summary, name: str, sums_up: bool, shares: Mapping[str, tuple[float, Share, str]], comparable: set[str]
+) -> Row:
+    """A row in which the best of the comparable ones is marked, if they are not all the same."""
+    found = {shares[label][0] for label in comparable}
+    top = max(found) if len(found) > 1 else None
+    cells = {x: Cell(share, of, note, x in comparable and share == top) for x, (share, of, note) in shares.items()}
+    return Row(name, sums_up, tuple(cells.get(label) for label in summary.labels))
+
+
+def held_out(summary: Summary) -> dict[str, list[tuple[str, float, float | None]]]:
+    """Errors on held-out demonstrations by the name of the result: each with that of predicting nothing."""
+    return {
+        fact.name: [
+            (name, value, fact.training.held_out.get(f"{name}_zero"))
+            for name, value in sorted(fact.training.held_out.items())
+            if not name.endswith(_BASELINES)
+        ]
+        for fact in summary.training
+    }
+
+
+def _machine(training: Training) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in sorted(training.versions.items()))
+    return f"{training.processor}: {versions}"
+
+
+_REPORT_COLUMNS = (
+    "label", "task", "difficulty", "successes", "episodes", "success", "low", "high", "successes_dp3", "success_dp3",
+    "mean_steps_to_success", "broke_down", "training_steps", "training_cpu_s",
+)  # fmt: skip
+
+
+def _report_rows(summary: Summary) -> _Rows:
+    trained = {(f.label, task): f.training for f in summary.training for task in f.tasks}
+    for x in summary.successes:
+        training = trained.get((x.label, x.task))
+        about = (training.steps, training.cpu_s) if training else ("", "")
+        s, d = x.success, x.success_dp3
+        shares = (s.successes, s.n, round(s.share, 6), s.low, s.high, d.successes, round(d.share, 6))
+        yield (x.label, x.task, x.group, *shares, x.mean_steps, x.broken, *about)
+
+
+_FLOW_COLUMNS = tuple(FlowError.model_fields)
+_EPISODE_COLUMNS = (
+    "label", "result", "step", "executed", "task", "seed", "episode", "layout", "success", "success_dp3", "steps",
+    "note", *_FLOW_COLUMNS,
+)  # fmt: skip
+
+
+def _episode_rows(results: Sequence[Result]) -> _Rows:
+    """Of all checkpoints, however many steps they executed."""
+    for r in sorted(tell_apart(results), key=lambda r: r.name):
+        for e in r.evaluations:
+            for o in sorted(e.outcomes, key=lambda o: o.trial):
+                flow = [None if o.flow is None else getattr(o.flow, name) for name in _FLOW_COLUMNS]
+                yield (
+                    r.label, r.name, e.step, e.executed, o.task, o.seed, o.episode, o.layout, int(o.success),
+                    int(o.success_dp3), o.steps, o.note, *flow,
+                )  # fmt: skip
+
+
+def _csv(columns: Sequence[str], rows: _Rows) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _scored_tables(scored: Sequence["ScoredTrial"]) -> list[tuple[str, list[str], list[list[Any]]]]:
+    if not scored:
+        return []
+    from flowlab.evaluation.scored import scored_rows
+
+    return [(title, list(columns), [list(row) for row in rows]) for title, columns, rows in scored_rows(scored)]
+
+
+def _panels(summary: Summary) -> list[Panel]:
+    """A panel for each difficulty, its mean beside what the paper has."""
+    panels = []
+    for group in dict.fromkeys(x.group for x in summary.successes):
+        mine = [x for x in summary.successes if x.group == group]
+        of_group = [g for g in summary.groups if g.group == group]
+        tasks = dict.fromkeys(x.task for x in mine)
+        rows = {t: {x.label: _mark(x.success, x.label, t) for x in mine if x.task == t} for t in tasks}
+        means = {g.label: replace(_mark(g.success, g.label, group), share=g.task_mean) for g in of_group}
+        heading = f"{group} ({len(tasks)} of {of_group[0].of})"
+        panels.append(Panel(heading, rows, means if len(tasks) > 1 else {}))
+    return panels
+
+
+def _mark(share: Share, label: str, over: str) -> Mark:
+    return Mark(share.share, share.low, share.high, paper_share(label, over))
+
+
+def _curves(summary: Summary) -> dict[str, dict[str, Curve]]:
+    curves: dict[str, dict[str, Curve]] = {}
+    for task in summary.tasks:
+        for label in summary.labels:
+            if points := [p for p in summary.curves if (p.task, p.label) == (task, label)]:
+                marks = tuple(Mark(p.success.share, p.success.low, p.success.high) for p in points)
+                curves.setdefault(task, {})[label] = Curve(tuple(p.cpu_min for p in points), marks)
+    return curves
+
+
+def _foreseen(summary: Summary) -> dict[str, dict[str, Foreseen]]:
+    errors: dict[str, dict[str, Foreseen]] = {}
+    for f in summary.flow:
+        if f.over in summary.tasks and f.error.pairs:
+            e = f.error
+            errors.setdefault(f.over, {})[f.label] = Foreseen(e.ade_mm, e.zero_ade_mm, e.fde_mm, e.zero_fde_mm)
+    return errors
+
+
+def _percent(share: float, digits: int = 1) -> str:
+    return f"{100 * share:.{digits}f}"
+
+
+def _p_value(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    """With thin spaces between thousands; a dash where there is none."""
+    return "–" if value is None else f"{value:,.{digits}f}".replace(",", "\u2009")
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}"
