@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from small_runs import NETWORK, header_of, make_run, options, policy_of, weights_of
+from small_runs import NETWORK, header_of, lines_of, make_run, options, policy_of, weights_of
 from synthetic import call_cli, files_below
 
 from flowlab.cli import main
@@ -119,7 +119,7 @@ def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: 
         tensors = header_of(run / "checkpoints/step-00000002.safetensors")
         shapes = [tensor["shape"] for key, tensor in tensors.items() if key != "__metadata__"]
         assert about["weights"] == sum(math.prod(shape) for shape in shapes)
-        assert about["cpu_s"] > 0
+        assert about["cpu_s"] == pytest.approx(lines_of(run)[-1]["cpu_s"], abs=0.051)
         assert about["held_out"]["action_l1"] > 0
         tried = {
             e["step"]: [(o["seed"], o["episode"], o["layout"]) for o in e["outcomes"]] for e in found["evaluations"]
@@ -226,7 +226,6 @@ def test_what_was_made_with_other_settings_is_refused_with_the_difference(
     assert not place.exists()
 
 
-@pytest.mark.xfail(reason="the number of episodes and the seeds of a finished unit are not looked at")
 @pytest.mark.parametrize("asked", [("--episodes", "3"), ("--seeds", "5")])
 def test_other_episodes_than_were_tried_are_not_passed_over(
     asked: tuple[str, str], experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
@@ -249,15 +248,6 @@ def test_a_damaged_unit_is_said(experiment: Path, recipe: Path, tmp_path: Path, 
         assert (code, said) == (3, "")
         assert err.startswith(f"flowlab: {place}: {sentence}")
         assert err.count("\n") == 1
-
-
-def test_more_points_than_the_datasets_have(experiment: Path, tmp_path: Path, capsys: Capture) -> None:
-    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
-    changed = write_recipe(tmp_path, variants=[{"name": "m9", "tasks": [TASK], "set": ["motion.points=9"]}])
-    code, said, err = bench(capsys, out, changed)
-    assert (code, said) == (3, "")
-    assert "motion.points is 9, and the dataset has 8 query points" in err
-    assert sorted(p.stem for p in (out / "units").iterdir()) == UNITS
 
 
 def test_a_dry_run_says_what_would_be_done(recipe: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -346,18 +336,11 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
         {"variants": [{"name": "a", "tasks": [TASK], "set": [f"motion.points={k}"]} for k in (2, 3)]}, "fdp-a",
     ),
 }  # fmt: skip
-NOT_LOOKED_AT = {"seed without layouts", "variants of one name"}
+BROKEN["too many query points"] = ({"query_points": 1}, "query points, and the datasets get 1; raise query_points")
+BROKEN["no policies"] = ({"policies": []}, "policies: ")
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, marks=pytest.mark.xfail(reason="not looked at before the work begins"))
-        if case in NOT_LOOKED_AT
-        else case
-        for case in BROKEN
-    ],
-)
+@pytest.mark.parametrize("case", BROKEN)
 def test_a_recipe_that_is_wrong_is_refused_before_anything_is_done(case: str, tmp_path: Path, capsys: Capture) -> None:
     changes, sentence = BROKEN[case]
     path = write_recipe(tmp_path, **changes)

@@ -288,7 +288,6 @@ def test_a_view_that_becomes_empty_fails_the_episode_and_says_why(reach: Stage) 
     assert outcome.steps == len(attempt.rollout) < 200
 
 
-@pytest.mark.xfail(raises=ValueError, reason="a context is made of no frame")
 def test_a_first_view_that_is_empty_fails_the_episode_too(reach: Stage) -> None:
     """And the others go on."""
     policy = repeater("dp3", "reach", crop=Box(low=(5, 5, 5), high=(6, 6, 6)))

@@ -130,7 +130,9 @@ def try_block(block: Block) -> int:
     torch.set_num_threads(1)
     policy = _policy(block.weights, block.device)
     stage = _stage(block.trials[0].task, block.scene)
-    for attempt in roll_out(policy, stage, block.trials, executed=block.executed):
+    known = log.read(block.episodes)  # by a worker that died over this block
+    todo = [trial for trial in block.trials if trial not in known]
+    for attempt in roll_out(policy, stage, todo, executed=block.executed):
         log.append(block.episodes, attempt.outcome)
     return len(block.trials)
 

@@ -1,6 +1,7 @@
 """A whole experiment from one recipe: datasets, policies, their evaluations; unit by unit, each done once."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from flowlab.errors import DataError, UnfinishedError, UsageError, unknown
 from flowlab.evaluation.collect import describe_training
 from flowlab.evaluation.evaluate import Subject, find_checkpoints, try_missing
 from flowlab.evaluation.results import UNITS, Result, read_result, write_result
-from flowlab.evaluation.trials import trials
+from flowlab.evaluation.trials import Trial, trials
 from flowlab.learning import runs
 from flowlab.learning.checkpoint import RUN, newest_checkpoint, read_run, read_trained, step_of
 from flowlab.learning.settings import POLICIES, TrainSettings, load_settings
@@ -45,9 +46,9 @@ class ExperimentRecipe(Settings):
 
     name: str
     description: str = ""
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...] = Field(min_length=1)
     """Tasks or groups."""
-    policies: tuple[str, ...]
+    policies: tuple[str, ...] = Field(min_length=1)
     demonstrations: PositiveInt
     """Trained on, of each task; one more is held out."""
     recipe: str
@@ -107,7 +108,9 @@ def with_variants(recipe: ExperimentRecipe, names: Sequence[str]) -> ExperimentR
 
 
 def plan(recipe: ExperimentRecipe) -> list[Unit]:
-    """Every unit, the policies' own before the variants. Raises :class:`UsageError` where a name does not exist."""
+    """Every unit, the policies' own before the variants. Raises :class:`UsageError` where a name does not exist or
+    stands for two, and where settings do not fit each other."""
+    _wanted(recipe, recipe.tasks[0])
     for name in recipe.policies:
         if name not in POLICIES:
             raise unknown("policy", name, POLICIES)
@@ -115,6 +118,9 @@ def plan(recipe: ExperimentRecipe) -> list[Unit]:
     units = [_unit(recipe, task, policy) for task in tasks for policy in recipe.policies]
     for variant in recipe.variants:
         units += [_unit(recipe, t, variant.policy, variant) for t in _tasks(variant.tasks) if t in tasks]
+    for name, times in Counter(u.name for u in units).items():
+        if times > 1:
+            raise UsageError(f"experiment {recipe.name}: {times} units are called {name}; give every variant a name")
     return units
 
 
@@ -131,7 +137,7 @@ def run_experiment(
     with other settings, and :class:`UnfinishedError` where units failed.
     """
     units = plan(recipe)
-    known = {u.name: _known(out, u) for u in units}
+    known = {u.name: _known(out, u, recipe) for u in units}
     todo = [u for u in units if known[u.name] is None]
     _extract(recipe, todo, out, workers)
 
@@ -161,8 +167,7 @@ def do_unit(recipe: ExperimentRecipe, out: Path, unit: Unit) -> str:
     folder = out / RUNS / unit.name
     _train(out / unit.dataset, folder, unit.settings, recipe.device)
     *earlier, last = find_checkpoints(folder)
-    whole = trials([unit.task], recipe.seeds, recipe.episodes)
-    some = trials([unit.task], recipe.seeds[:1], recipe.curve_episodes) if recipe.curve_episodes else []
+    some, whole = _wanted(recipe, unit.task)
     wanted: list[tuple[Subject, Any]] = [*((s, some) for s in earlier if some), (last, whole)]
     for subject, of_subject in wanted:
         try_missing(subject, of_subject)
@@ -220,7 +225,12 @@ def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: Variant | N
         *(variant.set if variant else ()),
     ]
     settings = load_settings(recipe.profile, policy, changes)
-    sampling = settings.motion.sampling
+    sampling, points = settings.motion.sampling, settings.motion.points
+    if policy == "fdp" and points > recipe.query_points:
+        raise UsageError(
+            f"experiment {recipe.name}: {task}-{label} wants {points} query points, and the datasets get "
+            f"{recipe.query_points}; raise query_points"
+        )
     return Unit(
         name=f"{task}-{label}",
         label=label,
@@ -238,14 +248,30 @@ def _place(out: Path, name: str) -> Path:
     return out / UNITS / f"{name}.json"
 
 
-def _known(out: Path, unit: Unit) -> Result | None:
-    """The result of a unit, if it is there already."""
+def _wanted(recipe: ExperimentRecipe, task: str) -> tuple[list[Trial], list[Trial]]:
+    """The episodes for every checkpoint but the last, and those for the last."""
+    some = trials([task], recipe.seeds[:1], recipe.curve_episodes) if recipe.curve_episodes else []
+    return some, trials([task], recipe.seeds, recipe.episodes)
+
+
+def _known(out: Path, unit: Unit, recipe: ExperimentRecipe) -> Result | None:
+    """The result of a unit, if it is there already, with all episodes that are wanted."""
     path = _place(out, unit.name)
     if not path.exists():
         return None
     result = read_result(path)
     _check_same(result.training.settings, unit.settings, path)
-    return result
+    some, whole = _wanted(recipe, unit.task)
+    *earlier, last = [{o.trial for o in e.outcomes} for e in result.evaluations]
+    if last == set(whole) and (not some or all(tried == set(some) for tried in earlier)):
+        return result
+    if _finished(out / RUNS / unit.name):
+        return None  # what is missing can be tried still
+    raise DataError(
+        f"{path}: has {len(last)} episodes, and other ones than the recipe's ({recipe.episodes} of each of the seeds "
+        f"{', '.join(map(str, recipe.seeds))}, {recipe.curve_episodes} at earlier checkpoints), and the run that could "
+        f"try them is gone; ask for those that it has, choose another --out, or delete it to make it anew"
+    )
 
 
 def _check_same(found: Any, wanted: TrainSettings, where: Path) -> None:

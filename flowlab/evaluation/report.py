@@ -18,7 +18,7 @@ from flowlab.errors import DataError
 from flowlab.evaluation.paper import CURVE_TASKS, beside, differences, paper_share
 from flowlab.evaluation.results import Result, Training
 from flowlab.evaluation.statistics import Share
-from flowlab.evaluation.summary import ALL, Summary, summarise, tell_apart
+from flowlab.evaluation.summary import ALL, GroupSuccess, Summary, summarise, tell_apart
 from flowlab.evaluation.trials import FlowError
 from flowlab.storage.files import write_json, write_whole
 from flowlab.viz.success import Curve, Foreseen, Mark, Panel, draw_curves, draw_flow, draw_success, policy_colours
@@ -92,6 +92,7 @@ def render(
         s=summary,
         ALL=ALL,
         success=success_rows(summary),
+        episodes_each=episodes_each(summary),
         held_out=held_out(summary),
         machines=sorted({_machine(f.training) for f in summary.training}),
         colours=policy_colours(summary.labels),
@@ -135,13 +136,19 @@ def success_rows(summary: Summary) -> list[Row]:
         tasks = list(dict.fromkeys(x.task for x in summary.successes if x.group == group))
         for task in tasks:
             on_task = {x.label: x.success for x in summary.successes if x.task == task}
-            shares = {label: (s.share, s, f"n {s.n}") for label, s in on_task.items()}
+            shares = {x: (s.share, s, "" if episodes_each(summary) else f"n {s.n}") for x, s in on_task.items()}
             rows.append(_row(summary, task, False, shares, set(shares)))
         if len(tasks) > 1 or (group == ALL and len(summary.tasks) > 1):
             most = max((g.tasks for g in of_group.values()), key=len)
             shares = {x: (g.task_mean, g.success, f"{len(g.tasks)} of {g.of} tasks") for x, g in of_group.items()}
             rows.append(_row(summary, group, True, shares, {x for x, g in of_group.items() if g.tasks == most}))
     return rows
+
+
+def episodes_each(summary: Summary) -> int | None:
+    """Episodes of each task and policy, if they are as many everywhere."""
+    counts = {x.success.n for x in summary.successes}
+    return counts.pop() if len(counts) == 1 else None
 
 
 def _row(
@@ -230,7 +237,7 @@ def _panels(summary: Summary) -> list[Panel]:
         of_group = [g for g in summary.groups if g.group == group]
         tasks = dict.fromkeys(x.task for x in mine)
         rows = {t: {x.label: _mark(x.success, x.label, t) for x in mine if x.task == t} for t in tasks}
-        means = {g.label: replace(_mark(g.success, g.label, group), share=g.task_mean) for g in of_group}
+        means = {g.label: _mean_mark(g) for g in of_group if len(g.tasks) == len(tasks)}
         heading = f"{group} ({len(tasks)} of {of_group[0].of})"
         panels.append(Panel(heading, rows, means if len(tasks) > 1 else {}))
     return panels
@@ -238,6 +245,12 @@ def _panels(summary: Summary) -> list[Panel]:
 
 def _mark(share: Share, label: str, over: str) -> Mark:
     return Mark(share.share, share.low, share.high, paper_share(label, over))
+
+
+def _mean_mark(group: GroupSuccess) -> Mark:
+    """With the paper's number only if ours is of the same tasks."""
+    mark = _mark(group.success, group.label, group.group)
+    return replace(mark, share=group.task_mean, paper=mark.paper if len(group.tasks) == group.of else None)
 
 
 def _curves(summary: Summary) -> dict[str, dict[str, Curve]]:

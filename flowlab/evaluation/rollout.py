@@ -15,7 +15,7 @@ from flowlab.evaluation.trials import Outcome, Trial
 from flowlab.learning.batches import Context
 from flowlab.learning.policy import Plan, PolicyNetwork
 from flowlab.records import Queries
-from flowlab.sim.environment import SceneSettings
+from flowlab.sim.environment import ACTION_SIZE, SceneSettings
 from flowlab.sim.rollout import Live, Rollout, Studio
 
 MAX_STEPS = 200
@@ -74,13 +74,14 @@ def roll_out(
         lanes[trial.episode % LANES].waiting.append(trial)
     device = next(policy.parameters()).device
     while ready := [lane for lane in lanes if lane.ready()]:
+        yield from (lane.give_up() for lane in ready if lane.is_blind)
+        ready = [lane for lane in ready if lane.under_way is not None]
+        if not ready:
+            continue
         spare = ready[0].context()
         whole = together([lane.context() if lane in ready else spare for lane in lanes]).to(device)
         plan = policy.plan(whole, [lane.noise for lane in lanes])
-        for lane in ready:
-            attempt = lane.go_on(plan)
-            if attempt is not None:
-                yield attempt
+        yield from (attempt for lane in ready if (attempt := lane.go_on(plan)) is not None)
 
 
 @dataclass
@@ -123,6 +124,19 @@ class _Lane:
             self._look()
         return self.under_way is not None
 
+    @property
+    def is_blind(self) -> bool:
+        """Whether the episode under way shows the policy nothing to begin with."""
+        return self.under_way is not None and bool(self.under_way.note)
+
+    def give_up(self) -> Attempt:
+        """End the episode under way after a step in which nothing is done: there is no attempt without one."""
+        episode = self.under_way
+        assert episode is not None
+        episode.live.step(np.zeros(ACTION_SIZE, np.float32))
+        self.under_way = None
+        return _finished(episode)
+
     def context(self) -> Context:
         """What a plan for the episode under way is decided on."""
         assert self.under_way is not None
@@ -141,7 +155,7 @@ class _Lane:
         actor.follow(plan, self._index)
         while not (over := self._is_over(episode)):
             live.step(np.clip(actor.act(), -1, 1))
-            if actor.plan_is_due:
+            if actor.plan_is_due or len(live.success) == self._max_steps:
                 episode.success_dp3 |= any(live.success[began:][-_LAST_LOOKED_AT:])
             self._look()
             if actor.plan_is_due:

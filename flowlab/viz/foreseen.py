@@ -136,7 +136,6 @@ def _draw_scene(
 
 
 def _draw_legend(figure: Figure, episode: Episode) -> None:
-    name = "true path, until the next plan"
-    true = Line2D([], [], color=INK, linewidth=0.9, marker="o", markersize=3.5, markevery=[1], label=name)
+    true = Line2D([], [], color=INK, linewidth=0.9, marker="o", markersize=3.5, markevery=[1], label="true path")
     marks = [dot("start", "white", QUIET), dot("predicted end", TIME_COLOURS(1.0), "none")]
     legend(figure, [*role_dots(episode), *marks, true], length=1.4)

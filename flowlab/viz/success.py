@@ -1,9 +1,10 @@
 """How often policies succeed, as pictures: by task, over training time; and how well they foresaw motion."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,7 +36,7 @@ class Panel:
     rows: Mapping[str, Mapping[str, Mark]]
     """By task, then by policy."""
     mean: Mapping[str, Mark]
-    """Over the group, by policy; empty where one task is all."""
+    """Over all of these tasks, by policy; empty where one task is all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +65,13 @@ _KNOWN = {
 _FURTHER = ("#c2453d", "#2a9aa8", "#6b7a2e", "#a05a2c", "#5b6ee0", "#4a4f57")
 _INK, _QUIET, _GRID, _BAND, _ZERO = "#22262c", "#747b85", "#e6e8ec", "#f5f6f8", "#d3d6db"
 _DPI = 150
-_NAMES_IN, _PLOT_IN, _WIDE_IN, _MARGIN_IN = 1.75, 3.3, 4.9, 0.3
-_HEAD_IN, _HEADING_IN, _AXIS_IN = 0.9, 0.42, 0.34
+_NAMES_IN, _PLOT_IN, _WIDE_IN, _MARGIN_IN = 1.75, 3.3, 3.9, 0.3
+_TITLE_IN, _LEGEND_IN, _ENTRY_IN, _HEADING_IN, _AXIS_IN = 0.5, 0.22, 1.3, 0.42, 0.34
 _ROW_IN, _POLICY_IN = 0.13, 0.105
 _ONE_COLUMN = 16
 """More rows than so many are set in two columns."""
 _MEAN = "mean of tasks"
+_Drawn = TypeVar("_Drawn")
 
 
 def policy_colours(labels: Sequence[str]) -> dict[str, str]:
@@ -96,99 +98,106 @@ def draw_flow(errors: Mapping[str, Mapping[str, Foreseen]], labels: Sequence[str
 def compose_success(panels: Sequence[Panel], labels: Sequence[str]) -> Figure:
     """Policies side by side in every task: a dot, its interval, and a diamond for what the paper reports."""
     colours = policy_colours(labels)
-    row = _ROW_IN + _POLICY_IN * len(labels)
     columns = _split(panels)
     plot = _PLOT_IN if len(columns) > 1 else _WIDE_IN
-    heights = [sum(_panel_height(p, row) for p in column) for column in columns]
-    figure = _figure(len(columns) * (_NAMES_IN + plot + _MARGIN_IN), _HEAD_IN + max(heights))
-    for k, column in enumerate(columns):
-        top = _HEAD_IN
-        for panel in column:
-            left = k * (_NAMES_IN + plot + _MARGIN_IN) + _NAMES_IN
-            size = (plot, _panel_height(panel, row) - _HEADING_IN - _AXIS_IN)
-            _draw_panel(_axes(figure, left, top + _HEADING_IN, *size), panel, colours)
-            top += _panel_height(panel, row)
+    heights = [sum(map(_panel_height, column)) for column in columns]
     drawn = [m for p in panels for marks in (*p.rows.values(), p.mean) for m in marks.values()]
     diamond = Line2D([], [], color=_QUIET, marker="D", markersize=4, markerfacecolor="white", linestyle="")
-    more = {"paper": diamond} if any(m.paper is not None for m in drawn) else {}
-    _write_head(figure, "Episodes solved", _handles(colours) | more)
+    handles = _handles(colours) | ({"paper": diamond} if any(m.paper is not None for m in drawn) else {})
+    figure, head = _figure("Episodes solved", handles, len(columns) * (_NAMES_IN + plot + _MARGIN_IN), max(heights))
+    for k, column in enumerate(columns):
+        top = head
+        for panel in column:
+            left = k * (_NAMES_IN + plot + _MARGIN_IN) + _NAMES_IN
+            size = (plot, _panel_height(panel) - _HEADING_IN - _AXIS_IN)
+            _draw_panel(_axes(figure, left, top + _HEADING_IN, *size), panel, colours)
+            top += _panel_height(panel)
     return figure
 
 
 def compose_curves(curves: Mapping[str, Mapping[str, Curve]], labels: Sequence[str]) -> Figure:
     """Success over CPU minutes of training: a panel for each task, a line with its interval for each policy."""
-    colours = policy_colours(labels)
+    colours = {x: c for x, c in policy_colours(labels).items() if any(x in of_task for of_task in curves.values())}
     across = min(len(curves), 3)
     down = -(-len(curves) // across)
-    width, height = 3.1, 2.75
-    figure = _figure(max(across * width + _MARGIN_IN, 4.2), _HEAD_IN + down * height)
+    width, height = 3.1, 2.5
+    size = max(across * width + _MARGIN_IN, 4.2), down * height
+    figure, head = _figure("Episodes solved while training", _handles(colours), *size)
     last = max(m for of_task in curves.values() for c in of_task.values() for m in c.minutes)
     for k, (task, of_task) in enumerate(curves.items()):
-        left, top = (k % across) * width + 0.6, _HEAD_IN + (k // across) * height + _HEADING_IN
-        axes = _axes(figure, left, top, width - 0.65, height - _HEADING_IN - 0.55)
-        for label in (x for x in labels if x in of_task):
-            _draw_curve(axes, of_task[label], colours[label])
+        left, top = (k % across) * width + 0.6, head + (k // across) * height + _HEADING_IN
+        axes = _axes(figure, left, top, width - 0.65, height - _HEADING_IN - 0.5)
+        for label, curve in sorted(of_task.items(), key=lambda item: labels.index(item[0])):
+            _draw_curve(axes, curve, colours[label])
         axes.set(xlim=(0, 1.03 * last), ylim=(-0.03, 1.03), yticks=np.linspace(0, 1, 6))
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         axes.yaxis.set_major_formatter(FuncFormatter(_percent))
         if k + across >= len(curves):
             axes.set_xlabel("CPU minutes of training", color=_QUIET, fontsize=9)
         _dress(axes, task)
-    shown = {x: c for x, c in colours.items() if any(x in of_task for of_task in curves.values())}
-    _write_head(figure, "Episodes solved while training", _handles(shown))
     return figure
 
 
 def compose_flow(errors: Mapping[str, Mapping[str, Foreseen]], labels: Sequence[str]) -> Figure:
     """Errors of predicted flow: a bar for each policy, before a pale one of predicting no motion on its episodes."""
-    shown = [x for x in labels if any(x in of_task for of_task in errors.values())]
-    colours = {x: c for x, c in policy_colours(labels).items() if x in shown}
-    row = _ROW_IN + 0.15 * len(shown)
-    plot = 2.9
-    figure = _figure(_NAMES_IN + 2 * (plot + _MARGIN_IN), _HEAD_IN + _HEADING_IN + row * len(errors) + 0.55)
+    colours = {x: c for x, c in policy_colours(labels).items() if any(x in of_task for of_task in errors.values())}
+    handles = {label: Patch(color=colour) for label, colour in colours.items()} | {"no motion": Patch(color=_ZERO)}
+    plot, lane = 2.9, 0.15
+    tall = sum(_row_height(of_task, lane) for of_task in errors.values())
+    size = _NAMES_IN + 2 * (plot + _MARGIN_IN), _HEADING_IN + tall + _AXIS_IN
+    figure, head = _figure("Predicted flow of moving points", handles, *size)
     for k, (name, heading) in enumerate((("ade", "mean error"), ("fde", "error at the last step"))):
         left = _NAMES_IN + k * (plot + _MARGIN_IN)
-        axes = _axes(figure, left, _HEAD_IN + _HEADING_IN, plot, row * len(errors))
+        axes = _axes(figure, left, head + _HEADING_IN, plot, tall)
         _dress(axes, f"{heading} [mm]")
-        _lay_rows(axes, list(errors) if k == 0 else [""] * len(errors), len(shown))
-        for y, of_task in enumerate(errors.values()):
-            for label, offset in zip(shown, _offsets(len(shown)), strict=True):
-                if label in of_task:
-                    e, wide = of_task[label], 0.62 / len(shown)
-                    axes.barh(y + offset, getattr(e, f"zero_{name}"), 1.25 * wide, color=_ZERO, zorder=2)
-                    axes.barh(y + offset, getattr(e, name), 0.75 * wide, color=colours[label], zorder=3)
+        for (_, label, e), y in zip(_each(errors, labels), _lay_rows(axes, errors, lane, named=k == 0), strict=True):
+            axes.barh(y, getattr(e, f"zero_{name}"), 0.8 * lane, color=_ZERO, zorder=2)
+            axes.barh(y, getattr(e, name), 0.45 * lane, color=colours[label], zorder=3)
         axes.set_xlim(0, None)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-    handles = {label: Patch(color=colour) for label, colour in colours.items()} | {"no motion": Patch(color=_ZERO)}
-    _write_head(figure, "Predicted flow of moving points", handles)
     return figure
 
 
 def _split(panels: Sequence[Panel]) -> list[Sequence[Panel]]:
     """One column, or two where rows are many, of heights as alike as can be."""
-    rows = [len(p.rows) + bool(p.mean) + 3 for p in panels]
     if sum(len(p.rows) for p in panels) <= _ONE_COLUMN or len(panels) == 1:
         return [panels]
-    cut = min(range(1, len(panels)), key=lambda k: max(sum(rows[:k]), sum(rows[k:])))
+    heights = [_panel_height(p) for p in panels]
+    cut = min(range(1, len(panels)), key=lambda k: max(sum(heights[:k]), sum(heights[k:])))
     return [panels[:cut], panels[cut:]]
 
 
-def _panel_height(panel: Panel, row: float) -> float:
-    return row * (len(panel.rows) + bool(panel.mean)) + _HEADING_IN + _AXIS_IN
+def _rows(panel: Panel) -> dict[str, Mapping[str, Mark]]:
+    return {**panel.rows, **({_MEAN: panel.mean} if panel.mean else {})}
+
+
+def _panel_height(panel: Panel) -> float:
+    return sum(_row_height(marks, _POLICY_IN) for marks in _rows(panel).values()) + _HEADING_IN + _AXIS_IN
+
+
+def _row_height(policies: Mapping[str, object], lane: float) -> float:
+    """Of a task that these policies tried [in]."""
+    return _ROW_IN + lane * len(policies)
 
 
 def _draw_panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
-    rows = {**panel.rows, **({_MEAN: panel.mean} if panel.mean else {})}
+    rows = _rows(panel)
     _dress(axes, panel.heading)
-    _lay_rows(axes, list(rows), len(colours))
+    places = _lay_rows(axes, rows, _POLICY_IN)
     axes.set(xlim=(-0.02, 1.02), xticks=np.linspace(0, 1, 6))
     axes.xaxis.set_major_formatter(FuncFormatter(_percent))
-    for y, marks in enumerate(rows.values()):
-        for (label, colour), offset in zip(colours.items(), _offsets(len(colours)), strict=True):
-            if label in marks:
-                _draw_mark(axes, marks[label], y + offset, colour)
+    for (_, label, mark), y in zip(_each(rows, list(colours)), places, strict=True):
+        _draw_mark(axes, mark, y, colours[label])
     if panel.mean:
         axes.get_yticklabels()[-1].set(color=_INK, fontweight="bold")
+
+
+def _each(rows: Mapping[str, Mapping[str, _Drawn]], labels: Sequence[str]) -> Iterator[tuple[str, str, _Drawn]]:
+    """Row, policy and what is drawn of it, from top to bottom."""
+    for name, of_row in rows.items():
+        for label in labels:
+            if label in of_row:
+                yield name, label, of_row[label]
 
 
 def _draw_mark(axes: Axes, mark: Mark, y: float, colour: str) -> None:
@@ -210,26 +219,38 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
     )  # fmt: skip
 
 
-def _offsets(count: int) -> list[float]:
-    """Where in its row each policy is, as a share of the row."""
-    step = 0.78 / count
-    return [(k - (count - 1) / 2) * step for k in range(count)]
-
-
-def _lay_rows(axes: Axes, names: Sequence[str], policies: int) -> None:
-    """A row for each name, the first on top; every other row is shaded."""
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_yticks(range(len(names)), names)
-    axes.tick_params(axis="y", labelsize=9 if policies > 1 else 8.5, labelcolor=_INK, pad=6)
+def _lay_rows(axes: Axes, rows: Mapping[str, Mapping[str, object]], lane: float, *, named: bool = True) -> list[float]:
+    """A row for each name, the first on top, every other one shaded; where each policy of each row is. The axis is in
+    inches."""
+    places, centres, top = [], [], 0.0
+    for k, of_row in enumerate(rows.values()):
+        height = _row_height(of_row, lane)
+        places += [top + _ROW_IN / 2 + (j + 0.5) * lane for j in range(len(of_row))]
+        centres.append(top + height / 2)
+        if k % 2 == 0:
+            axes.axhspan(top, top + height, color=_BAND, linewidth=0, zorder=0)
+        top += height
+    axes.set_ylim(top, 0)
+    axes.set_yticks(centres, list(rows) if named else [""] * len(rows))
+    axes.tick_params(axis="y", labelsize=9, labelcolor=_INK, pad=6)
     axes.grid(visible=False, axis="y")
-    for y in range(0, len(names), 2):
-        axes.axhspan(y - 0.5, y + 0.5, color=_BAND, linewidth=0, zorder=0)
+    return places
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(title: str, handles: Mapping[str, Line2D | Patch], width: float, height: float) -> tuple[Figure, float]:
+    """A figure with room of this size [in] below its head, and the head's height: the title, and what colours mean."""
+    columns = max(int(width / _ENTRY_IN), 1)
+    head = _TITLE_IN + _LEGEND_IN * -(-len(handles) // columns)
+    height += head
     figure = Figure(figsize=(width, height), dpi=_DPI)
     FigureCanvasAgg(figure)
-    return figure
+    figure.text(0.15 / width, 1 - 0.28 / height, title, fontsize=14, weight="bold", color=_INK, va="center")
+    figure.legend(
+        handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(0.13 / width, 1 - 0.48 / height),
+        ncols=columns, frameon=False, fontsize=9, labelcolor=_INK, handlelength=1.4, columnspacing=1.4,
+        handletextpad=0.6, borderpad=0, borderaxespad=0,
+    )  # fmt: skip
+    return figure, head
 
 
 def _axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
@@ -243,17 +264,6 @@ def _handles(colours: Mapping[str, str]) -> dict[str, Line2D | Patch]:
         label: Line2D([], [], color=colour, marker="o", markersize=5, linewidth=1.6)
         for label, colour in colours.items()
     }
-
-
-def _write_head(figure: Figure, title: str, handles: Mapping[str, Line2D | Patch]) -> None:
-    """The title, and what colours mean, in lines that fit the figure's width."""
-    width, height = figure.get_size_inches()
-    figure.text(0.15 / width, 1 - 0.28 / height, title, fontsize=14, weight="bold", color=_INK, va="center")
-    figure.legend(
-        handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(0.08 / width, 1 - 0.46 / height),
-        ncols=min(len(handles), max(int(width / 1.25), 1)), frameon=False, fontsize=9, labelcolor=_INK,
-        handlelength=1.4, columnspacing=1.4, handletextpad=0.6, borderpad=0.2, borderaxespad=0,
-    )  # fmt: skip
 
 
 def _percent(share: float, _: object = None) -> str:
