@@ -115,6 +115,17 @@ def test_many_tasks_are_set_in_two_columns() -> None:
     assert len(set(left(28))) == 1
 
 
+def test_long_names_have_room() -> None:
+    task, label = "button-press-topdown-wall", "a-run-of-last-november-with-seed-3"
+    inside(compose_success([Panel("easy", {task: {label: A, "fdp": B}}, {})], [label, "fdp"]))
+    inside(compose_flow({task: {label: Foreseen(4, 20, 7, 40)}}, [label]))
+    inside(
+        compose_curves(
+            {task: {f"{label}-{k}": Curve((1, 2), (A, B)) for k in range(4)}}, [f"{label}-{k}" for k in range(4)]
+        )
+    )
+
+
 def test_colours_tell_policies_apart() -> None:
     known = ["dp3", "mba", "fdp", "fdp-m50", "fdp-m200", "fdp-object", "fdp-stratified", "fdp-auxiliary"]
     colours = policy_colours([*known, "mine", "yours"])

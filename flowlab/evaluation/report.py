@@ -21,7 +21,7 @@ from flowlab.evaluation.statistics import Share
 from flowlab.evaluation.summary import ALL, GroupSuccess, Summary, summarise, tell_apart
 from flowlab.evaluation.trials import FlowError
 from flowlab.storage.files import write_json, write_whole
-from flowlab.viz.success import Curve, Foreseen, Mark, Panel, draw_curves, draw_flow, draw_success, policy_colours
+from flowlab.viz.success import DPI, Curve, Foreseen, Mark, Panel, draw_curves, draw_flow, draw_success, policy_colours
 
 if TYPE_CHECKING:
     from flowlab.evaluation.scored import ScoredTrial
@@ -99,11 +99,25 @@ def render(
         paper=tables,
         curve_tasks=CURVE_TASKS,
         differences=differences(summary) if tables else [],
-        figures={name: base64.b64encode(path.read_bytes()).decode() for name, path in figures.items()},
+        figures={name: _Image.of(path.read_bytes()) for name, path in figures.items()},
         films=films,
         scored=scored,
         version=__version__,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """A figure within the page."""
+
+    content: str
+    width: int
+    """On a screen, where lengths count 96 to the inch."""
+
+    @classmethod
+    def of(cls, png: bytes) -> "_Image":
+        """A PNG has its width behind its signature and the name of the first chunk."""
+        return cls(base64.b64encode(png).decode(), round(int.from_bytes(png[16:20]) * 96 / DPI))
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,8 +295,8 @@ def _p_value(p: float) -> str:
 
 
 def _number(value: float | None, digits: int = 1) -> str:
-    """With thin spaces between thousands; a dash where there is none."""
-    return "–" if value is None else f"{value:,.{digits}f}".replace(",", "\u2009")
+    """With narrow spaces between thousands, where no line breaks; a dash where there is none."""
+    return "–" if value is None else f"{value:,.{digits}f}".replace(",", "\u202f")
 
 
 def _short(value: float) -> str:

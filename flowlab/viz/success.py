@@ -1,7 +1,7 @@
 """How often policies succeed, as pictures: by task, over training time; and how well they foresaw motion."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -64,12 +64,14 @@ _KNOWN = {
 }  # fmt: skip
 _FURTHER = ("#c2453d", "#2a9aa8", "#6b7a2e", "#a05a2c", "#5b6ee0", "#4a4f57")
 _INK, _QUIET, _GRID, _BAND, _ZERO = "#22262c", "#747b85", "#e6e8ec", "#f5f6f8", "#d3d6db"
-_DPI = 150
-_NAMES_IN, _PLOT_IN, _WIDE_IN, _MARGIN_IN = 1.75, 3.3, 3.9, 0.3
-_TITLE_IN, _LEGEND_IN, _ENTRY_IN, _HEADING_IN, _AXIS_IN = 0.5, 0.22, 1.3, 0.42, 0.34
+DPI = 150
+"""Of the pictures."""
+_PLOT_IN, _WIDE_IN, _MARGIN_IN, _LETTER_IN = 3.3, 3.9, 0.3, 0.074
+_TITLE_IN, _LEGEND_IN, _HEADING_IN, _AXIS_IN = 0.5, 0.22, 0.42, 0.34
 _ROW_IN, _POLICY_IN = 0.13, 0.105
 _ONE_COLUMN = 16
 """More rows than so many are set in two columns."""
+_FEW_CURVES = 12
 _MEAN = "mean of tasks"
 _Drawn = TypeVar("_Drawn")
 
@@ -100,15 +102,16 @@ def compose_success(panels: Sequence[Panel], labels: Sequence[str]) -> Figure:
     colours = policy_colours(labels)
     columns = _split(panels)
     plot = _PLOT_IN if len(columns) > 1 else _WIDE_IN
+    names = _width_of(task for panel in panels for task in _rows(panel))
     heights = [sum(map(_panel_height, column)) for column in columns]
     drawn = [m for p in panels for marks in (*p.rows.values(), p.mean) for m in marks.values()]
     diamond = Line2D([], [], color=_QUIET, marker="D", markersize=4, markerfacecolor="white", linestyle="")
     handles = _handles(colours) | ({"paper": diamond} if any(m.paper is not None for m in drawn) else {})
-    figure, head = _figure("Episodes solved", handles, len(columns) * (_NAMES_IN + plot + _MARGIN_IN), max(heights))
+    figure, head = _figure("Episodes solved", handles, len(columns) * (names + plot + _MARGIN_IN), max(heights))
     for k, column in enumerate(columns):
         top = head
         for panel in column:
-            left = k * (_NAMES_IN + plot + _MARGIN_IN) + _NAMES_IN
+            left = k * (names + plot + _MARGIN_IN) + names
             size = (plot, _panel_height(panel) - _HEADING_IN - _AXIS_IN)
             _draw_panel(_axes(figure, left, top + _HEADING_IN, *size), panel, colours)
             top += _panel_height(panel)
@@ -118,7 +121,7 @@ def compose_success(panels: Sequence[Panel], labels: Sequence[str]) -> Figure:
 def compose_curves(curves: Mapping[str, Mapping[str, Curve]], labels: Sequence[str]) -> Figure:
     """Success over CPU minutes of training: a panel for each task, a line with its interval for each policy."""
     colours = {x: c for x, c in policy_colours(labels).items() if any(x in of_task for of_task in curves.values())}
-    across = min(len(curves), 3)
+    across = min(len(curves), 3 if len(curves) <= _FEW_CURVES else 4)
     down = -(-len(curves) // across)
     width, height = 3.1, 2.5
     size = max(across * width + _MARGIN_IN, 4.2), down * height
@@ -142,12 +145,12 @@ def compose_flow(errors: Mapping[str, Mapping[str, Foreseen]], labels: Sequence[
     """Errors of predicted flow: a bar for each policy, before a pale one of predicting no motion on its episodes."""
     colours = {x: c for x, c in policy_colours(labels).items() if any(x in of_task for of_task in errors.values())}
     handles = {label: Patch(color=colour) for label, colour in colours.items()} | {"no motion": Patch(color=_ZERO)}
-    plot, lane = 2.9, 0.15
+    names, plot, lane = _width_of(errors), 2.9, 0.15
     tall = sum(_row_height(of_task, lane) for of_task in errors.values())
-    size = _NAMES_IN + 2 * (plot + _MARGIN_IN), _HEADING_IN + tall + _AXIS_IN
+    size = names + 2 * (plot + _MARGIN_IN), _HEADING_IN + tall + _AXIS_IN
     figure, head = _figure("Predicted flow of moving points", handles, *size)
     for k, (name, heading) in enumerate((("ade", "mean error"), ("fde", "error at the last step"))):
-        left = _NAMES_IN + k * (plot + _MARGIN_IN)
+        left = names + k * (plot + _MARGIN_IN)
         axes = _axes(figure, left, head + _HEADING_IN, plot, tall)
         _dress(axes, f"{heading} [mm]")
         for (_, label, e), y in zip(_each(errors, labels), _lay_rows(axes, errors, lane, named=k == 0), strict=True):
@@ -156,6 +159,11 @@ def compose_flow(errors: Mapping[str, Mapping[str, Foreseen]], labels: Sequence[
         axes.set_xlim(0, None)
         axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     return figure
+
+
+def _width_of(names: Iterable[str]) -> float:
+    """Room for the longest name, a gap, and no less than a column of figures looks well with [in]."""
+    return max(_LETTER_IN * max(map(len, names)) + 0.2, 0.9)
 
 
 def _split(panels: Sequence[Panel]) -> list[Sequence[Panel]]:
@@ -239,10 +247,10 @@ def _lay_rows(axes: Axes, rows: Mapping[str, Mapping[str, object]], lane: float,
 
 def _figure(title: str, handles: Mapping[str, Line2D | Patch], width: float, height: float) -> tuple[Figure, float]:
     """A figure with room of this size [in] below its head, and the head's height: the title, and what colours mean."""
-    columns = max(int(width / _ENTRY_IN), 1)
+    columns = max(int(width / (_width_of(handles) + 0.3)), 1)
     head = _TITLE_IN + _LEGEND_IN * -(-len(handles) // columns)
     height += head
-    figure = Figure(figsize=(width, height), dpi=_DPI)
+    figure = Figure(figsize=(width, height), dpi=DPI)
     FigureCanvasAgg(figure)
     figure.text(0.15 / width, 1 - 0.28 / height, title, fontsize=14, weight="bold", color=_INK, va="center")
     figure.legend(
