@@ -231,6 +231,7 @@ def test_one_step_of_a_plan_against_eight() -> None:
     assert (push.other_success.successes, push.other_success.n) == (3, 4)
     assert (push.paired.first_only, push.paired.second_only) == (1, 2)
     assert summarise([r]).successes[0].success.n == 6
+    assert summarise([result("fdp", outcomes("push", "ss"), evaluations=[old])]).strides == ()  # of other weights
     assert summarise(EXAMPLE).strides == ()
 
 
@@ -359,13 +360,14 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_same_results_give_the_same_bytes(tmp_path: Path) -> None:
+    results = [*EXAMPLE, result("mba", outcomes("push", "bsb"), outcomes("assembly", "sb"))]
     mixed = [
         r.model_copy(
             update={"evaluations": tuple(e.model_copy(update={"outcomes": e.outcomes[::-1]}) for e in r.evaluations)}
         )
-        for r in random.Random(0).sample(EXAMPLE, len(EXAMPLE))
+        for r in random.Random(0).sample(results, len(results))
     ]
-    write_report(tmp_path / "one", EXAMPLE)
+    write_report(tmp_path / "one", results)
     write_report(tmp_path / "two", mixed)
     one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
     assert one.keys() == {
@@ -508,6 +510,8 @@ def test_the_best_is_bold_where_policies_can_be_compared() -> None:
         "hard": [False, True],
         ALL: [False, False],  # of other tasks
     }
+    part = result("fdp-m50", outcomes("push", "sssff"))  # of one task as good as fdp of two
+    assert bold(*EXAMPLE, part)["hard"] == [False, True, False]
     even = [result(label, outcomes("push", "sf")) for label in ("dp3", "mba")]
     assert bold(*even) == {"push": [False, False]}
     assert bold(*even, result("fdp", outcomes("push", "ff"))) == {"push": [True, True, False]}
