@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from flowlab.errors import DataError
 from flowlab.evaluation.paper import MAIN, QUERY_PLACES, QUERY_POINTS, beside, differences, paper_share
-from flowlab.evaluation.report import success_rows, write_report
+from flowlab.evaluation.report import success_panels, success_rows, write_report
 from flowlab.evaluation.results import Evaluation, Result, Training
 from flowlab.evaluation.scored import ScoredTrial
 from flowlab.evaluation.summary import ALL, pool_flow, summarise
@@ -398,6 +398,19 @@ def test_nothing_is_no_report(tmp_path: Path) -> None:
     assert not (tmp_path / "r").exists()
 
 
+def test_the_figure_has_means_of_the_same_tasks_only() -> None:
+    medium, hard = success_panels(summarise([*EXAMPLE, result("mba", outcomes("push", "s"))]))
+    assert (medium.heading, list(medium.rows), medium.mean) == ("medium (1 of 11)", ["hammer"], {})
+    assert (hard.heading, list(hard.rows)) == ("hard (2 of 6)", ["assembly", "push"])
+    assert hard.rows["push"]["fdp"].share == 0.7
+    assert hard.rows["push"]["fdp"].paper == 0.617
+    assert hard.rows["push"]["dp3"].paper is None
+    assert {label: (m.share, m.paper) for label, m in hard.mean.items()} == {"dp3": (0.325, None), "fdp": (0.6, None)}
+    all_six = ("assembly", "hand-insert", "pick-out-of-hole", "pick-place", "push", "push-back")
+    (hard,) = success_panels(summarise([result("fdp", *(outcomes(task, "sf") for task in all_six))]))
+    assert (hard.mean["fdp"].share, hard.mean["fdp"].paper) == (0.5, 0.556)
+
+
 # the page
 
 
@@ -493,6 +506,7 @@ def test_the_page_shows_policies_side_by_side(tmp_path: Path) -> None:
     assert rows[2] == ["push", "40.0 17–69 n 10", "70.0 40–89 n 10", "50.0 9–91 n 2"]
     assert rows[3][1:3] == ["32.5 16–61 2 of 6 tasks", "60.0 39–84 2 of 6 tasks"]
     assert rows[0][2:] == ["–", "–"]
+    assert [bold for *_, bold in page.tables[0][3]] == [False, False, True, False]
     assert page.rows("policies")[0] == ["dp3 against fdp", "14", "0", "4", "5", "5", "0.12"]
     assert ["all", "fdp", "14", "7.3 21.8", "13.3 33.3", "60.0 30.0", "50.0 20.0", "1.0"] in page.rows("on", "policy")
     main = page.rows("", "easy")

@@ -62,7 +62,7 @@ def write_report(
 
 def draw_figures(folder: Path, summary: Summary) -> dict[str, Path]:
     """Draw what there is to draw, by the name of the figure; figures of an earlier report go."""
-    success, curves, flow = _panels(summary), _curves(summary), _foreseen(summary)
+    success, curves, flow = success_panels(summary), _curves(summary), _foreseen(summary)
     paths = {name: folder / f"{name}.png" for name in ("success", "curves", "flow")}
     if success:
         draw_success(success, summary.labels, paths["success"])
@@ -243,7 +243,7 @@ def _scored_tables(scored: Sequence["ScoredTrial"]) -> list[tuple[str, list[str]
     return [(title, list(columns), [list(row) for row in rows]) for title, columns, rows in scored_rows(scored)]
 
 
-def _panels(summary: Summary) -> list[Panel]:
+def success_panels(summary: Summary) -> list[Panel]:
     """A panel for each difficulty, its mean beside what the paper has."""
     panels = []
     for group in dict.fromkeys(x.group for x in summary.successes):
