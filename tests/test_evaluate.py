@@ -235,6 +235,9 @@ WRONG: dict[str, tuple[list[str], int, str]] = {
     "seed without layouts": (["--seeds", "0,4000"], 2, "seed 4000: evaluation seeds are from 0 to 3999"),
     "more than is planned": (["--execute", "16"], 2, "plans 15 steps ahead, so execute 1 to 15"),
     "data for a simulation": (["--data", "d"], 2, "--data is about held-out demonstrations; add --offline"),
+    "films of no episodes": (
+        ["--offline", "--films", "2", "--out", "o"], 2, "--offline tries no episodes, so leave out --films, --out"
+    ),
     "no such run": (["nowhere"], 3, "nowhere: not a training run (it has no policy.json)"),
     "no such checkpoint": (
         ["nowhere/checkpoints/step-00000001.safetensors"], 3, "nowhere: not a training run (it has no policy.json)",

@@ -58,6 +58,10 @@ def evaluate(
     early, the same command does the rest, and more episodes add to those that are there.
     """
     if offline:
+        given = {"--task": tasks, "--execute": execute, "--checkpoints": checkpoints, "--workers": workers,
+                 "--films": films, "--out": out}  # fmt: skip
+        if about_rollouts := [name for name, value in given.items() if value]:
+            raise UsageError(f"--offline tries no episodes, so leave out {', '.join(about_rollouts)}")
         _offline(runs, data, as_json)
         return
     if data is not None:
@@ -114,7 +118,7 @@ def _film(subjects: Sequence["Subject"], results: Sequence["Result"], count: int
 
 
 def _offline(runs: Sequence[Path], data: Path | None, as_json: bool) -> None:
-    from flowlab.evaluation.offline import evaluate_offline, offline_rows
+    from flowlab.evaluation.offline import demonstration_rows, evaluate_offline, offline_rows
     from flowlab.learning.checkpoint import load_policy
 
     reports = {run: evaluate_offline(load_policy(run), data) for run in runs}
@@ -122,8 +126,8 @@ def _offline(runs: Sequence[Path], data: Path | None, as_json: bool) -> None:
         print_json({str(run): report.model_dump(mode="json") for run, report in reports.items()})
         return
     for run, report in reports.items():
-        columns, rows = offline_rows(report)
-        print_table(columns, rows, f"{run}: errors on demonstrations it was not trained on")
+        print_table(*offline_rows(report), f"{run}: errors on demonstrations it was not trained on")
+        print_table(*demonstration_rows(report), "every demonstration")
 
 
 def numbers(text: str) -> list[int]:

@@ -12,7 +12,7 @@ from flowlab.learning.batches import Context
 from flowlab.learning.policy import Plan, PolicySpec
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
-from flowlab.records import Cloud, Frame, Queries
+from flowlab.records import Frame, Queries
 
 
 class Actor:
@@ -53,8 +53,9 @@ class Actor:
         points = self._observer.sample(cloud).points_world[: self.spec.settings.encoder.points]
         first = not self._seen
         if first and self.spec.settings.policy == "fdp":
-            self.queries = self._choose(cloud, frame)
-        self._seen.extend([(points, np.asarray(state, np.float32))] * (self._seen.maxlen or 1 if first else 1))
+            self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
+        times = self.spec.settings.history if first else 1  # what was before the first step is taken to be like it
+        self._seen.extend([(points, np.asarray(state, np.float32))] * times)
 
     def context(self) -> Context:
         """What a plan is to be decided on."""
@@ -75,9 +76,6 @@ class Actor:
     def act(self) -> Float32[np.ndarray, "A"]:
         """The action of this step."""
         return self._planned.popleft()
-
-    def _choose(self, cloud: Cloud, frame: Frame) -> Queries:
-        return queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
 
 
 def together(contexts: Sequence[Context]) -> Context:

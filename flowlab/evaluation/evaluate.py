@@ -15,7 +15,7 @@ from flowlab.evaluation.rollout import LANES, Stage, roll_out
 from flowlab.evaluation.trials import Trial, check_unseen
 from flowlab.learning.checkpoint import CHECKPOINTS, Trained, load_policy, newest_checkpoint, read_trained, step_of
 from flowlab.learning.policy import PolicyNetwork
-from flowlab.pipeline.engine import StartEngine
+from flowlab.pipeline.engine import LocalEngine, StartEngine
 from flowlab.sim.environment import SceneSettings
 
 FOLDER = "evaluation"
@@ -200,6 +200,4 @@ def _stage(task: str, scene: SceneSettings) -> Stage:
 
 def local_engine(workers: int) -> StartEngine[Block, int]:
     """Processes of this machine."""
-    from flowlab.pipeline.engine import LocalEngine
-
     return partial(LocalEngine, workers=workers, imports=[__name__])

@@ -153,13 +153,14 @@ class _Lane:
             flow = plan.flow[self._index, now:].cpu().numpy()
             episode.predicted.append((began, flow))
         actor.follow(plan, self._index)
-        while not (over := self._is_over(episode)):
+        over = False
+        while not over:
             live.step(np.clip(actor.act(), -1, 1))
             if actor.plan_is_due or len(live.success) == self._max_steps:
                 episode.success_dp3 |= any(live.success[began:][-_LAST_LOOKED_AT:])
             self._look()
+            over = self._is_over(episode)
             if actor.plan_is_due:
-                over = self._is_over(episode)
                 break
         if not over:
             return None

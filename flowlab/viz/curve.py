@@ -192,7 +192,7 @@ def _draw_losses(axes: Axes, training: Sequence[Line]) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    _dress(axes, "training", "loss")
+    dress(axes, "training", "loss")
     _label_ends(axes, ends)
 
 
@@ -202,7 +202,7 @@ def _draw_rate(axes: Axes, training: Sequence[Line]) -> None:
     highest = float(values.max(initial=0))
     axes.set_ylim(0, 1.1 * highest or 1)
     axes.set_yticks([0, highest], ["0", f"{highest:.3g}"])
-    _dress(axes, "learning rate", "")
+    dress(axes, "learning rate", "")
 
 
 def _plot(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> None:
@@ -229,7 +229,7 @@ def _draw_errors(axes: Axes, panel: Panel, validation: Sequence[Line]) -> None:
         ends.append(End(value, text, colour))
     axes.set_ylim(0, top)
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-    _dress(axes, panel.heading, panel.unit)
+    dress(axes, panel.heading, panel.unit)
     _label_ends(axes, ends)
 
 
@@ -269,7 +269,8 @@ def _spread(wanted: Sequence[float], gap: float) -> list[float]:
     return places
 
 
-def _dress(axes: Axes, heading: str, ylabel: str) -> None:
+def dress(axes: Axes, heading: str, ylabel: str = "") -> None:
+    """A panel's grid, ticks and heading."""
     axes.grid(color=_GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(length=0, which="both", labelsize=8.5, labelcolor=_QUIET)

@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from flowlab.storage.files import temporary_path
+from flowlab.viz.curve import dress
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ _KNOWN = {
     "fdp-object": "#7b5bb8", "fdp-stratified": "#b8438a", "fdp-auxiliary": "#8a7a5c",
 }  # fmt: skip
 _FURTHER = ("#c2453d", "#2a9aa8", "#6b7a2e", "#a05a2c", "#5b6ee0", "#4a4f57")
-_INK, _QUIET, _GRID, _BAND, _ZERO = "#22262c", "#747b85", "#e6e8ec", "#f5f6f8", "#d3d6db"
+_INK, _QUIET, _BAND, _ZERO = "#22262c", "#747b85", "#f5f6f8", "#d3d6db"
 DPI = 150
 """Of the pictures."""
 _PLOT_IN, _WIDE_IN, _MARGIN_IN, _LETTER_IN = 3.3, 3.9, 0.3, 0.074
@@ -137,7 +138,7 @@ def compose_curves(curves: Mapping[str, Mapping[str, Curve]], labels: Sequence[s
         axes.yaxis.set_major_formatter(FuncFormatter(_percent))
         if k + across >= len(curves):
             axes.set_xlabel("CPU minutes of training", color=_QUIET, fontsize=9)
-        _dress(axes, task)
+        dress(axes, task)
     return figure
 
 
@@ -152,7 +153,7 @@ def compose_flow(errors: Mapping[str, Mapping[str, Foreseen]], labels: Sequence[
     for k, (name, heading) in enumerate((("ade", "mean error"), ("fde", "error at the last step"))):
         left = names + k * (plot + _MARGIN_IN)
         axes = _axes(figure, left, head + _HEADING_IN, plot, tall)
-        _dress(axes, f"{heading} [mm]")
+        dress(axes, f"{heading} [mm]")
         for (_, label, e), y in zip(_each(errors, labels), _lay_rows(axes, errors, lane, named=k == 0), strict=True):
             axes.barh(y, getattr(e, f"zero_{name}"), 0.8 * lane, color=_ZERO, zorder=2)
             axes.barh(y, getattr(e, name), 0.45 * lane, color=colours[label], zorder=3)
@@ -190,7 +191,7 @@ def _row_height(policies: Mapping[str, object], lane: float) -> float:
 
 def _draw_panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
     rows = _rows(panel)
-    _dress(axes, panel.heading)
+    dress(axes, panel.heading)
     places = _lay_rows(axes, rows, _POLICY_IN)
     axes.set(xlim=(-0.02, 1.02), xticks=np.linspace(0, 1, 6))
     axes.xaxis.set_major_formatter(FuncFormatter(_percent))
@@ -276,15 +277,6 @@ def _handles(colours: Mapping[str, str]) -> dict[str, Line2D | Patch]:
 
 def _percent(share: float, _: object = None) -> str:
     return f"{100 * share:.0f} %"
-
-
-def _dress(axes: Axes, heading: str) -> None:
-    axes.grid(color=_GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(length=0, which="both", labelsize=8.5, labelcolor=_QUIET)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    axes.set_title(heading, loc="left", fontsize=10.5, color=_INK, pad=8)
 
 
 def _save(figure: Figure, png: Path) -> None:
