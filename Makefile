@@ -10,7 +10,7 @@ WORKSPACE := {low: [-0.5, 0.25, -0.2], high: [0.5, 0.97, 0.8]}
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-demo: .venv/run ## real simulation to a picture, and to a policy that is tried; then an episode recorded, labelled from pictures, graded
+demo: .venv/run ## real simulation to a picture, and to a policy that is tried; then an episode recorded, labeled from pictures, graded
 	$(BIN)/flowlab extract-sim $(TASKS) --episodes 3 --set write.depth=true --out demo/data
 	$(BIN)/flowlab validate demo/data
 	$(BIN)/flowlab viz demo/data --task hammer --png demo/hammer.png --save demo/hammer.rrd
@@ -22,8 +22,8 @@ demo: .venv/run ## real simulation to a picture, and to a policy that is tried; 
 	@echo "How often the policy succeeds: demo/report/report.html; the motion it foresees: demo/predicted.png"
 	@$(MAKE) --no-print-directory demo-real
 
-demo-real: .venv/run .venv/opengl ## the second half of the demo: what a camera would have seen, labelled blind
-	$(BIN)/flowlab grade --tasks hammer --tracker bodies --tracker lucas-kanade --out demo/graded
+demo-real: .venv/run .venv/opengl ## the second half of the demo: what a camera would have seen, labeled blind
+	$(BIN)/flowlab grade --tasks hammer --tracker rigid-bodies --tracker lucas-kanade --out demo/graded
 	$(BIN)/flowlab track-real demo/graded/recordings --set observer.crop="$(WORKSPACE)" --out demo/real
 	$(BIN)/flowlab validate demo/real
 	$(BIN)/flowlab viz demo/real --png demo/real.png --save demo/real.rrd --mp4 demo/real.mp4
@@ -68,7 +68,7 @@ clean: ## remove environments and everything made by the targets above
 	$(PIP) install -c constraints.txt -e .
 	@touch $@
 
-# Simulated cameras see colour through OpenGL. As root on Debian it is installed; else `flowlab grade` says what to do.
+# Simulated cameras see color through OpenGL. As root on Debian it is installed; else `flowlab grade` says what to do.
 .venv/opengl: .venv/run
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! ldconfig -p | grep -q libEGL_mesa; then \
 	  echo "installing OpenGL (libegl1 libgl1-mesa-dri)"; \

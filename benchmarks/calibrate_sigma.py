@@ -1,9 +1,9 @@
-"""Fit the weights of ``flowlab.tracking.quality`` on simulated recordings, and check them on others.
+"""Fit the weights of ``flowlab.tracking.uncertainty`` on simulated recordings, and check them on others.
 
     python benchmarks/calibrate_sigma.py --recordings DIR
 
 Simulates tasks that no benchmark grades, labels them with both trackers that need no weights, and fits the 68th
-percentile of the error by quantile regression, for each source of a position apart. Needs OpenGL for colour.
+percentile of the error by quantile regression, for each source of a position apart. Needs OpenGL for color.
 """
 
 import argparse
@@ -13,15 +13,15 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from flowlab.pipeline.grading import read_clip
-from flowlab.pipeline.simulated import SimulatedRecording, simulate_recording
-from flowlab.records import Source
+from flowlab.grading import ground_truth
+from flowlab.grading.grade import read_clip
+from flowlab.grading.simulate import SimulatedRecording, simulate_recording
+from flowlab.records import PositionSource
 from flowlab.sim.sensor import CLEAN, KINECT
-from flowlab.tracking import ground_truth
-from flowlab.tracking.chunks import ChunkSettings, follow
-from flowlab.tracking.lift import LiftSettings, lift
-from flowlab.tracking.quality import EVIDENCE, WEIGHTS, evidence
-from flowlab.tracking.tracker import make_tracker
+from flowlab.tracking.base import make_tracker
+from flowlab.tracking.chunking import ChunkSettings, follow
+from flowlab.tracking.lifting import LiftSettings, lift
+from flowlab.tracking.uncertainty import EVIDENCE, WEIGHTS, evidence
 
 TASKS = (
     "button-press", "coffee-push", "dial-turn", "handle-press", "lever-pull", "peg-insert-side", "plate-slide",
@@ -30,7 +30,7 @@ TASKS = (
 """None of the eight that accuracy is reported on."""
 QUANTILE = 0.68
 _SAMPLE = 6000
-"""Positions per source: enough for nine weights, few enough for the linear programme."""
+"""Positions per source: enough for nine weights, few enough for the linear program."""
 
 
 def main() -> None:
@@ -38,13 +38,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path, required=True, help="folder to keep the recordings in")
     arguments = parser.parse_args()
-    rows: dict[Source, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {source: [] for source in WEIGHTS}
+    rows: dict[PositionSource, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {source: [] for source in WEIGHTS}
     for k, task in enumerate(TASKS):
         for sensor in (KINECT, CLEAN) if k % 3 == 0 else (KINECT,):
             folder = arguments.recordings / f"{task}-{'clean' if sensor is CLEAN else 'kinect'}"
             simulate_recording(folder, task, 100 + k, SimulatedRecording(sensor=sensor))
             print(folder.name, flush=True)
-            for name in ("bodies", "lucas-kanade"):
+            for name in ("rigid-bodies", "lucas-kanade"):
                 _collect(folder, name, k, rows)
     rng = np.random.default_rng(0)
     for source, parts in rows.items():
@@ -71,7 +71,7 @@ def _collect(folder: Path, name: str, group: int, rows: dict) -> None:
 
 
 def _fit(values: np.ndarray, log_error: np.ndarray) -> np.ndarray:
-    """Linear quantile regression (Koenker and Bassett 1978) as a linear programme.
+    """Linear quantile regression (Koenker and Bassett 1978) as a linear program.
 
     More evidence of trouble never lowers the stated error. With depth it grows as a triangulating camera's noise
     does, by the square: the simulated scenes span too little depth to tell.

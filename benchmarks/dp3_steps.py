@@ -1,7 +1,7 @@
 """DP3's own extraction steps, rebuilt for today's libraries without flowlab.
 
 Source: MetaWorldEnv and PointCloudGenerator of the 3D-Diffusion-Policy repository. Per step they take one
-colour picture for the image observation and one colour picture with depth for the cloud, both shaded with
+color picture for the image observation and one color picture with depth for the cloud, both shaded with
 shadows; Open3D unprojects all pixels; numpy turns and crops them in DP3's frame; and 1024 are sampled.
 
 Differences: MetaWorld v3 instead of v2; ``mujoco`` instead of mujoco-py, so depth is a pass of its own (see
@@ -46,24 +46,24 @@ class Extractor:
         """Of every frame of the expert's episode: all points in the crop (P, 6), and their sample (1024, 3)."""
         observation = reset(self.env, seed)
         for _ in range(STEPS):
-            self._colour()  # the image observation
+            self._color()  # the image observation
             cloud = self._cloud()
             yield cloud, sample(cloud)
             observation, _ = step(self.env, self.policy, observation)
 
     def _cloud(self) -> np.ndarray:
-        """xyz in DP3's frame [m] and colour of every pixel in the crop."""
-        colour, depth = self._colour(), self._depth()
+        """xyz in DP3's frame [m] and color of every pixel in the crop."""
+        color, depth = self._color(), self._depth()
         cloud = open3d.geometry.PointCloud.create_from_depth_image(
             open3d.geometry.Image(depth), self.intrinsics, depth_scale=1.0
         )
         cloud.transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # to OpenGL's axes, which DP3 takes for the world's
-        points = np.concatenate([np.asarray(cloud.points), colour.reshape(-1, 3)], axis=1)
+        points = np.concatenate([np.asarray(cloud.points), color.reshape(-1, 3)], axis=1)
         points[:, :3] = points[:, :3] @ self.turn.T
         points = points[np.all(points[:, :3] > CROP_LOW, axis=1)]
         return points[np.all(points[:, :3] < CROP_HIGH, axis=1)]
 
-    def _colour(self) -> np.ndarray:
+    def _color(self) -> np.ndarray:
         self.renderer.update_scene(self.env.data, "corner2")
         return self.renderer.render()
 

@@ -33,22 +33,22 @@ import torch
 from careful_user import reset
 from extract import machine, print_rows
 
+from flowlab.data.batches import ObservationBatch
+from flowlab.deployment.runner import PolicyRunner
+from flowlab.engines.local import LocalEngine
 from flowlab.evaluation import rollout
-from flowlab.evaluation.actor import Actor
-from flowlab.evaluation.rollout import MAX_STEPS, Stage, roll_out
+from flowlab.evaluation.rollout import MAX_STEPS, SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial, trials
 from flowlab.geometry.sampling import farthest_points
-from flowlab.learning.batches import Context
-from flowlab.learning.checkpoint import Loaded, load_policy
-from flowlab.learning.policy import PolicyNetwork
-from flowlab.learning.runs import Machine, prepare, run
-from flowlab.learning.settings import load_settings
 from flowlab.perception.observer import ObserverSettings
-from flowlab.pipeline.engine import LocalEngine
+from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
-from flowlab.pipeline.run import extract
-from flowlab.sim.environment import SceneSettings, Simulation
-from flowlab.sim.rollout import Live, Studio
+from flowlab.policies.base import PolicyNetwork
+from flowlab.policies.checkpoint import LoadedPolicy, load_policy
+from flowlab.policies.settings import load_settings
+from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
+from flowlab.sim.simulation import SceneSettings, Simulation
+from flowlab.training.run import ComputeSettings, prepare_run, run
 
 OURS, SHADED, DEPTH = "flowlab", "DP3's runner", "DP3's runner, depth only"
 LAST_LOOKED_AT = 2
@@ -57,10 +57,10 @@ ABOVE_TABLE_M = 1e-3
 """The table's top is at 0; flowlab's clouds leave it out by what owns the pixel, here its height must do."""
 PARTS: dict[str, tuple[Any, str]] = {
     "plans": (PolicyNetwork, "plan"),
-    "pictures": (Live, "frame"),
-    "clouds": (Actor, "see"),
+    "pictures": (EpisodeRecorder, "frame"),
+    "clouds": (PolicyRunner, "see"),
     "physics": (Simulation, "step"),
-    "resets": (Studio, "begin"),
+    "resets": (TaskSimulator, "begin"),
     "flow errors": (rollout, "flow_error"),
 }
 """What of ours is clocked apart; none of these calls another."""
@@ -99,12 +99,12 @@ class Dp3Runner(dp3_steps.Extractor):
             self.renderer = mujoco.Renderer(self.env.model, dp3_steps.SIZE, dp3_steps.SIZE)
             self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
 
-    def try_all(self, layouts: Sequence[int], max_steps: int = MAX_STEPS) -> Tried:
+    def try_all(self, scene_seeds: Sequence[int], max_steps: int = MAX_STEPS) -> Tried:
         """Try these layouts, one after the other."""
         begin = time.process_time()
-        needed = [self._try(layout, max_steps) for layout in layouts]
+        needed = [self._try(layout, max_steps) for layout in scene_seeds]
         spent = time.process_time() - begin
-        steps = (max_steps,) * len(layouts)
+        steps = (max_steps,) * len(scene_seeds)
         return Tried(spent, steps, tuple(n or max_steps for n in needed), sum(n is not None for n in needed))
 
     def _try(self, layout: int, max_steps: int) -> int | None:
@@ -113,14 +113,14 @@ class Dp3Runner(dp3_steps.Extractor):
         reset(self.env, layout)
         noise = torch.Generator().manual_seed(layout)
         first = self._look()
-        seen = deque([first] * s.history, maxlen=s.history)
+        seen = deque([first] * s.n_obs_steps, maxlen=s.n_obs_steps)
         queries = np.zeros((0, 3), np.float32)
         if s.policy == "fdp":
             queries = first[0][farthest_points(first[0], self.network.spec.queries["points"])]
         done, needed = 0, None
         while done < max_steps:
             plan = self.network.plan(self._context(seen, queries), [noise])
-            actions = plan.action[0, s.history - 1 :][: s.executed].numpy()
+            actions = plan.action[0, s.n_obs_steps - 1 :][: s.n_action_steps].numpy()
             success = []
             for action in actions[: max_steps - done]:
                 _, _, _, _, info = self.env.step(np.clip(action, -1, 1))
@@ -134,7 +134,7 @@ class Dp3Runner(dp3_steps.Extractor):
     def _look(self) -> tuple[np.ndarray, np.ndarray]:
         """Cloud (N, 3) and state (9,) of this moment."""
         if not self.depth_only:
-            super()._colour()  # the image observation
+            super()._color()  # the image observation
         cloud = self._cloud()
         points = dp3_steps.sample(self._known_to_network(cloud[:, :3]) if self.in_world else cloud)
         wanted = self.network.spec.settings.encoder.points
@@ -144,9 +144,9 @@ class Dp3Runner(dp3_steps.Extractor):
         state = [d.body("hand").xpos, d.site("rightEndEffector").xpos, d.site("leftEndEffector").xpos]
         return points.astype(np.float32), np.concatenate(state).astype(np.float32)
 
-    def _colour(self) -> np.ndarray:
+    def _color(self) -> np.ndarray:
         if not self.depth_only:
-            return super()._colour()
+            return super()._color()
         self.renderer.update_scene(self.env.data, "corner2")
         return np.zeros((dp3_steps.SIZE, dp3_steps.SIZE, 3), np.uint8)
 
@@ -157,8 +157,8 @@ class Dp3Runner(dp3_steps.Extractor):
         xyz = points @ (self.turn @ unshifted.T @ camera.xmat.reshape(3, 3).T) + camera.xpos
         return xyz[np.all((xyz > self.low) & (xyz < self.high), axis=1)]
 
-    def _context(self, seen: Sequence[tuple[np.ndarray, np.ndarray]], queries: np.ndarray) -> Context:
-        return Context(
+    def _context(self, seen: Sequence[tuple[np.ndarray, np.ndarray]], queries: np.ndarray) -> ObservationBatch:
+        return ObservationBatch(
             points=torch.from_numpy(np.stack([points for points, _ in seen])),
             state=torch.from_numpy(np.stack([state for _, state in seen])),
             observed=torch.arange(len(seen))[None],
@@ -170,22 +170,24 @@ class Dp3Runner(dp3_steps.Extractor):
 class Bench:
     """The ways to try one policy, set up and warm."""
 
-    def __init__(self, loaded: Loaded, episodes: int, shaded_episodes: int) -> None:
+    def __init__(self, loaded: LoadedPolicy, episodes: int, shaded_episodes: int) -> None:
         self.policy, self.task = loaded.policy, loaded.trained.policy.tasks[0]
         self.trials = trials([self.task], [0], episodes)
         scene = SceneSettings.model_validate(loaded.trained.scene).model_copy(update={"rgb": False})
-        self.stage = Stage(self.task, scene)
+        self.stage = SimulatorPool(self.task, scene)
         self.shaded = Dp3Runner(self.policy, self.task, scene, depth_only=False)
         self.depth = Dp3Runner(self.policy, self.task, scene, depth_only=True)
-        layouts = [t.layout for t in self.trials]
+        scene_seeds = [t.scene_seed for t in self.trials]
         self.ways: dict[str, Callable[..., Tried]] = {
             OURS: partial(self._ours, self.trials),
-            DEPTH: partial(self.depth.try_all, layouts),
-            SHADED: partial(self.shaded.try_all, layouts[:shaded_episodes]),
+            DEPTH: partial(self.depth.try_all, scene_seeds),
+            SHADED: partial(self.shaded.try_all, scene_seeds[:shaded_episodes]),
         }
-        self._ours(self.trials[:4], max_steps=self.policy.spec.settings.executed)  # compiles, and builds environments
+        self._ours(
+            self.trials[:4], max_steps=self.policy.spec.settings.n_action_steps
+        )  # compiles, and builds environments
         for runner in (self.depth, self.shaded):
-            runner.try_all(layouts[:1], max_steps=2)
+            runner.try_all(scene_seeds[:1], max_steps=2)
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
@@ -262,16 +264,16 @@ def summary(found: dict[str, list[Tried]]) -> list[dict[str, Any]]:
     return rows
 
 
-def untrained(folder: Path) -> Loaded:
+def untrained(folder: Path) -> LoadedPolicy:
     """A policy for push after a single step; after fifty, it would solve some layouts."""
     recipe = load_recipe("metaworld", ["episodes=3"])
     extract(recipe, ("push",), folder / "data", start_engine=partial(LocalEngine, workers=1))
     settings = load_settings("fast", "fdp", ["run.minutes=null", "run.steps=1", "data.held_out=0"])
-    run(prepare(folder / "data", folder / "run", settings, Machine(device="cpu")), lambda _: None)
+    run(prepare_run(folder / "data", folder / "run", settings, ComputeSettings(device="cpu")), lambda _: None)
     return load_policy(folder / "run")
 
 
-def examine(name: str, loaded: Loaded, args: argparse.Namespace) -> dict[str, Any]:
+def examine(name: str, loaded: LoadedPolicy, args: argparse.Namespace) -> dict[str, Any]:
     """Measure with one policy, and print what came out."""
     bench = Bench(loaded, args.episodes, min(args.rgb_episodes, args.episodes))
     found = bench.measure(args.repeats)
@@ -294,7 +296,7 @@ def main() -> None:
     parser.add_argument("run", nargs="?", type=Path, help="folder of a training run; its first task is tried")
     parser.add_argument("--episodes", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--rgb-episodes", type=int, default=1, help="how many of them with colour, which takes long")
+    parser.add_argument("--rgb-episodes", type=int, default=1, help="how many of them with color, which takes long")
     parser.add_argument("--json", type=Path, help="also write the figures here")
     args = parser.parse_args()
     torch.set_num_threads(1)

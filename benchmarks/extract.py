@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 from flowlab.perception.observer import Observer
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.stage import EpisodeRequest
-from flowlab.pipeline.stages import ExpertStage, ObserverStage
+from flowlab.pipeline.stages.simulation import ExpertStage, ObserverStage
 from flowlab.pipeline.units import WorkUnit
 from flowlab.pipeline.worker import run_unit
 
@@ -39,7 +39,7 @@ DP3_STEPS, DP3_TASKS = 20, 2
 """DP3's steps take about a hundred times as long, so only this much of them is timed: first steps, first tasks."""
 SAME_COUNT, SAME_PLACE, SAME_SHARE = 0.002, 1e-3, 0.999
 """Two clouds count as the same if their sizes differ by less than this share, and this share of their points
-has a point of the other cloud within so many metres."""
+has a point of the other cloud within so many meters."""
 
 OURS = "flowlab"
 

@@ -5,7 +5,7 @@ repository (Ze et al., 2024), with ``config/simple_dp3.yaml``; written anew in p
 It has their layers in their sizes, so it does their arithmetic: 7.4 million parameters. Its U-Net has one residual
 block at each level where DP3's own has two.
 
-Differences: 16 steps are predicted, as in ``dp3.yaml``, instead of 4; inputs come normalised; diffusers' DDIM
+Differences: 16 steps are predicted, as in ``dp3.yaml``, instead of 4; inputs come normalized; diffusers' DDIM
 scheduler is written out; masks for inpainting, which hide nothing in this configuration, are left out.
 """
 
@@ -24,7 +24,7 @@ TRAIN_STEPS, INFERENCE_STEPS = 100, 10
 
 
 class SimpleDP3(nn.Module):
-    """From two frames of N points and the robot's state to a plan; everything normalised to [-1, 1]."""
+    """From two frames of N points and the robot's state to a plan; everything normalized to [-1, 1]."""
 
     alpha_bar: Tensor
 
@@ -163,15 +163,15 @@ class Ema:
 
     @torch.no_grad()
     def update(self, model: nn.Module) -> None:
-        """Call after each step of the optimiser."""
+        """Call after each step of the optimizer."""
         keep = min(1 - max(self.steps, 1) ** -0.75, 0.9999)  # nothing at the first two updates, as in theirs
         self.steps += 1
         for average, now in zip(self.model.parameters(), model.parameters(), strict=True):
             average.mul_(keep).add_(now, alpha=1 - keep)
 
 
-def make_optimiser(model: nn.Module) -> torch.optim.Optimizer:
-    """DP3's optimiser."""
+def make_optimizer(model: nn.Module) -> torch.optim.Optimizer:
+    """DP3's optimizer."""
     return torch.optim.AdamW(model.parameters(), lr=1e-4, betas=(0.95, 0.999), eps=1e-8, weight_decay=1e-6)
 
 
@@ -184,13 +184,13 @@ def make_batch(size: int, points: int) -> tuple[Tensor, Tensor, Tensor]:
 if __name__ == "__main__":
     model = SimpleDP3()
     print(f"{sum(p.numel() for p in model.parameters()) / 1e6:.2f} million parameters")
-    ema, optimiser = Ema(model), make_optimiser(model)
+    ema, optimizer = Ema(model), make_optimizer(model)
     points, state, action = make_batch(128, int(sys.argv[1]) if len(sys.argv) > 1 else 1024)
     for warm in (False, True):
         start = time.process_time()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         model.loss(points, state, action).backward()
-        optimiser.step()
+        optimizer.step()
         ema.update(model)
         if warm:
             print(f"training step of 128 windows: {time.process_time() - start:.2f} CPU seconds")

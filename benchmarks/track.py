@@ -1,9 +1,9 @@
-"""Accuracy and cost of labelling recordings: `bodies`, and what a user would do otherwise, on the same pictures.
+"""Accuracy and cost of labeling recordings: `bodies`, and what a user would do otherwise, on the same pictures.
 
     python benchmarks/track.py --recordings DIR [--real CLIP...] [--json FILE]
 
 Simulated: the eight tasks of tests of the method, seed 0, 320x240, a Kinect-like sensor and a clean one (needs OpenGL
-for colour). Real: any recordings with a ``ground_truth.npz``. Each table has the paper's chunks with Lucas-Kanade and
+for color). Real: any recordings with a ``ground_truth.npz``. Each table has the paper's chunks with Lucas-Kanade and
 the nearest pixel's depth (the naive way), the same with flowlab's lifting, and ``bodies``. Two metric rules are
 printed: TAPVid-3D as published, and that of the targets (image side by width, first frame left out).
 """
@@ -17,13 +17,13 @@ from typing import Any
 
 import cv2
 
-from flowlab.pipeline.grading import Grades, grade, read_clip
-from flowlab.pipeline.simulated import SimulatedRecording, simulate_recording
+from flowlab.grading.grade import Grades, grade, read_clip
+from flowlab.grading.metrics import MetricSettings, average, measure
+from flowlab.grading.simulate import SimulatedRecording, simulate_recording
 from flowlab.sim.sensor import CLEAN, KINECT
-from flowlab.tracking.chunks import ChunkSettings
-from flowlab.tracking.lift import LiftSettings
-from flowlab.tracking.metrics import MetricSettings, average, measure
-from flowlab.tracking.tracker import Tracker, make_tracker
+from flowlab.tracking.base import Tracker, make_tracker
+from flowlab.tracking.chunking import ChunkSettings
+from flowlab.tracking.lifting import LiftSettings
 
 TASKS = ("assembly", "basketball", "door-open", "drawer-open", "faucet-open", "hammer", "pick-place", "push")
 NEAREST_PIXEL = LiftSettings(window_px=0, jump_m=1e6)
@@ -44,13 +44,13 @@ class Way:
 
 def ways() -> list[Way]:
     """What is compared."""
-    follow, bodies = make_tracker("lucas-kanade"), make_tracker("bodies")
+    follow, bodies = make_tracker("lucas-kanade"), make_tracker("rigid-bodies")
     return [
         Way("LK, nearest pixel", follow, lifting=NEAREST_PIXEL),
         Way("LK, stride 16", follow, ChunkSettings(stride=16)),
         Way("LK, stride 8", follow),
         Way("LK, stride 1 (paper)", follow, ChunkSettings(stride=1)),
-        Way("bodies", bodies),
+        Way("rigid-bodies", bodies),
     ]
 
 

@@ -19,18 +19,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from simple_dp3 import Ema, SimpleDP3, make_batch, make_optimiser
+from simple_dp3 import Ema, SimpleDP3, make_batch, make_optimizer
 
+from flowlab.data.batches import ObservationBatch
+from flowlab.engines.local import LocalEngine
 from flowlab.evaluation.rollout import roll_out
-from flowlab.learning.batches import Context
-from flowlab.learning.processes import has_bf16
-from flowlab.learning.runs import Machine, prepare, run
-from flowlab.learning.settings import load_settings
-from flowlab.learning.trainer import Trainer
-from flowlab.pipeline.engine import LocalEngine
+from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
-from flowlab.pipeline.run import extract
-from flowlab.sim.environment import SceneSettings
+from flowlab.policies.settings import load_settings
+from flowlab.sim.simulation import SceneSettings
+from flowlab.training.distributed import has_bf16
+from flowlab.training.run import ComputeSettings, prepare_run, run
+from flowlab.training.trainer import Trainer
 
 WINDOWS, POINTS = 128, 512
 SAME_MATHS = (
@@ -109,17 +109,17 @@ def trainer_of(
     """A run that will not be finished."""
     settings = load_settings(profile, policy, ["run.minutes=null", "run.steps=100000", "data.held_out=0", *overrides])
     out = Path(tempfile.mkdtemp(dir=folder)) / "run"
-    return prepare(data, out, settings, Machine(device="cpu", precision=precision))
+    return prepare_run(data, out, settings, ComputeSettings(device="cpu", precision=precision))
 
 
 def planning(trainer: Trainer) -> Callable[[], object]:
     """Plans for one observation."""
     policy, s = trainer.average.policy, trainer.settings
     points, queries = (s.encoder.points, s.motion.points if s.policy == "fdp" else 0)
-    context = Context(
-        points=torch.rand(s.history, points, 3),
-        state=torch.rand(s.history, policy.spec.state_width),
-        observed=torch.arange(s.history)[None],
+    context = ObservationBatch(
+        points=torch.rand(s.n_obs_steps, points, 3),
+        state=torch.rand(s.n_obs_steps, policy.spec.state_width),
+        observed=torch.arange(s.n_obs_steps)[None],
         queries=torch.rand(1, queries, 3),
         task=torch.zeros(1, dtype=torch.long),
     )
@@ -129,13 +129,13 @@ def planning(trainer: Trainer) -> Callable[[], object]:
 def reference() -> tuple[Callable[[], object], Callable[[], object]]:
     """A training step and a plan of the reference."""
     model = SimpleDP3()
-    optimiser, average = make_optimiser(model), Ema(model)
+    optimizer, average = make_optimizer(model), Ema(model)
     points, state, action = make_batch(WINDOWS, POINTS)
 
     def step() -> None:
         model.loss(points, state, action).backward()
-        optimiser.step()
-        optimiser.zero_grad()
+        optimizer.step()
+        optimizer.zero_grad()
         average.update(model)
 
     return step, lambda: model.plan(points[:1], state[:1])
@@ -161,7 +161,7 @@ def outcome(
     settings = load_settings("fast", policy, [f"run.minutes={minutes}", "data.held_out=0", *overrides])
     out = Path(tempfile.mkdtemp(dir=folder)) / "run"
     begin = time.process_time()
-    trainer = prepare(data, out, settings, Machine(device="cpu", precision="auto"))
+    trainer = prepare_run(data, out, settings, ComputeSettings(device="cpu", precision="auto"))
     run(trainer, lambda _: None)
     spent = (time.process_time() - begin) / 60
     stage = Stage(task, SceneSettings())

@@ -1,18 +1,21 @@
 """flowlab: 3D-flow datasets from robot demonstrations, and policies trained on them."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from flowlab.evaluation.robot import Policy
+from flowlab.version import __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from flowlab.deployment.policy import Policy
+
 __all__ = ["Policy", "__version__"]
+
+_LAZY = {"Policy": "flowlab.deployment.policy"}
+"""Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is large only when it is asked for, so that the command line starts at once."""
-    if name == "Policy":
-        from flowlab.evaluation.robot import Policy
-
-        return Policy
+    """Import a public name when it is first asked for."""
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'flowlab' has no attribute '{name}'")

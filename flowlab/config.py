@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from flowlab.errors import UsageError, unknown
+from flowlab.errors import UsageError, unknown_name
 
 
 class Settings(BaseModel):
@@ -23,7 +23,7 @@ def read_named(kind: str, name: str, folder: str = ".") -> str:
     if not path.suffix:
         known = {p.name.removesuffix(".yaml"): p for p in (_shipped() / folder).iterdir() if p.name.endswith(".yaml")}
         if name not in known:
-            raise unknown(kind, name, known)
+            raise unknown_name(kind, name, known)
         return str(known[name].read_text())
     try:
         return path.read_text()
@@ -46,7 +46,7 @@ def override(values: dict[str, Any], text: str, known: Iterable[str], example: s
     if not equals or not all(path):
         raise UsageError(f"--set {text}: must look like {example}")
     if path[0] not in known:
-        raise unknown("setting", path[0], known)
+        raise unknown_name("setting", path[0], known)
     set_value(values, path, text)
 
 
@@ -69,7 +69,7 @@ def explain(error: ValidationError, model: type[Settings]) -> str:
     where = ".".join(map(str, first["loc"]))
     if first["type"] == "extra_forbidden":
         known = _fields_at(model, first["loc"][:-1])
-        return f"{where}: {unknown('setting', str(first['loc'][-1]), known)}"
+        return f"{where}: {unknown_name('setting', str(first['loc'][-1]), known)}"
     return f"{where}: {first['msg']} (found {first['input']!r})"
 
 

@@ -32,9 +32,14 @@ class MissingLibraryError(FlowlabError):
     """An optional library (OpenGL, say) that the chosen settings need and this machine lacks."""
 
 
-def unknown(kind: str, found: str, known: Iterable[str]) -> UsageError:
+def unknown_name(kind: str, found: str, known: Iterable[str]) -> UsageError:
     """An error for a name that does not exist: near misses first, else everything that does exist."""
     names = sorted(known)
     near = difflib.get_close_matches(found, names, n=3, cutoff=0.6)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names)}"
     return UsageError(f"no {kind} is called '{found}'; {hint}")
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says, or its name where it says nothing."""
+    return str(error).strip().split("\n")[0] or type(error).__name__

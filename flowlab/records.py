@@ -3,7 +3,7 @@
     Frame -> Cloud -> Observation -> Queries -> Tracks2D (real only) -> Tracks3D -> Episode -> shard
 
 A real recording and a simulated rollout are both a :class:`Demonstration`; they differ only in how
-tracks are made. World coordinates are metres in the dataset's world frame, which ``docs/conventions.md``
+tracks are made. World coordinates are meters in the dataset's world frame, which ``docs/conventions.md``
 describes; float32 unless said otherwise.
 """
 
@@ -95,7 +95,7 @@ class Clip:
 
     rgb: UInt8[np.ndarray, "T H W 3"]
     depth: Float32[np.ndarray, "T H W"]
-    """z-depth [m], registered to the colour picture; 0 where there is no reading."""
+    """z-depth [m], registered to the color picture; 0 where there is no reading."""
     camera: Camera
 
     def __len__(self) -> int:
@@ -107,7 +107,7 @@ class Tracks2D:
     """Where a tracker says every query point is in the picture."""
 
     xy: Float32[np.ndarray, "T M 2"]
-    """Pixel (x right, y down), integer pixel centres; always finite, a held position where the point is lost."""
+    """Pixel (x right, y down), integer pixel centers; always finite, a held position where the point is lost."""
     visible: Bool[np.ndarray, "T M"]
     """Whether the tracker believes that the camera sees the point there."""
     confidence: Float32[np.ndarray, "T M"]
@@ -119,10 +119,10 @@ class Tracks2D:
     depth: Float32[np.ndarray, "T M"] | None = None
     """z-depth [m] where a model of the motion gives it, for points out of sight too; 0 where none does."""
     residual: Float32[np.ndarray, "T M"] | None = None
-    """How badly that model explains colour and depth around the point, 0 to 1; -1 where none does."""
+    """How badly that model explains color and depth around the point, 0 to 1; -1 where none does."""
 
 
-class Source(IntEnum):
+class PositionSource(IntEnum):
     """Where the position of a tracked point comes from, at one instant."""
 
     SIMULATOR = 0
@@ -136,7 +136,7 @@ class Source(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Foreseen:
+class FlowPrediction:
     """Where a policy expected the query points of an episode to go, plan by plan."""
 
     step: Int[np.ndarray, "P"]
@@ -152,7 +152,7 @@ class Quality:
     sigma: Float32[np.ndarray, "T M"]
     """Stated error [m]: 68 % of errors are meant to be below it."""
     source: UInt8[np.ndarray, "T M"]
-    """The :class:`Source` of every position."""
+    """The :class:`PositionSource` of every position."""
     depth_valid: Bool[np.ndarray, "T M"]
     """Whether the sensor gave a depth at the point's pixel that fits the point."""
     forward_backward: Float32[np.ndarray, "T M"]
@@ -231,12 +231,12 @@ class TrackedDemo:
     queried: QueriedDemo
     tracks: Tracks2D
     tracker: Mapping[str, Any]
-    """Name, licence and version of the tracker, and what weights it used."""
+    """Name, license and version of the tracker, and what weights it used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One labelled demonstration, as it is stored. Row t of every array is the same instant; fields that a
+    """One labeled demonstration, as it is stored. Row t of every array is the same instant; fields that a
     :class:`Demonstration` has too mean the same."""
 
     task: str

@@ -1,4 +1,4 @@
-"""Small recordings made by hand: a camera looks at a tilted plane, and every frame is told apart by its colour."""
+"""Small recordings made by hand: a camera looks at a tilted plane, and every frame is told apart by its color."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from flowlab.geometry.camera import Camera
-from flowlab.real.recording import Recording, RecordingSettings, open_recording
+from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
 
 WIDTH, HEIGHT, STEPS = 32, 24, 6
 INTRINSICS = {"width": WIDTH, "height": HEIGHT, "fx": 30.0, "fy": 31.0, "cx": 15.2, "cy": 11.7}
@@ -23,7 +23,7 @@ def colors(steps: int = STEPS, size: tuple[int, int] = (WIDTH, HEIGHT)) -> np.nd
 
 
 def counts(steps: int = STEPS, size: tuple[int, int] = (WIDTH, HEIGHT)) -> np.ndarray:
-    """Depth pictures (T, H, W) uint16 in millimetres, with a hole that never closes."""
+    """Depth pictures (T, H, W) uint16 in millimeters, with a hole that never closes."""
     t, v, u = np.meshgrid(np.arange(steps), np.arange(size[1]), np.arange(size[0]), indexing="ij")
     depth = (700 + 10 * t + 3 * u + 2 * v).astype(np.uint16)
     depth[:, 2:4, 5:9] = 0

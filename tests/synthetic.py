@@ -10,9 +10,9 @@ import pytest
 
 from flowlab.cli import main
 from flowlab.geometry.camera import Camera
-from flowlab.records import Entity, Episode, Quality, Queries, Role, Source, Tracks3D
+from flowlab.records import Entity, Episode, PositionSource, Quality, Queries, Role, Tracks3D
 from flowlab.storage import stats
-from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarise
+from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarize
 from flowlab.storage.manifest import Manifest, Receipt
 from flowlab.storage.shard import episode_digest, write_shard
 
@@ -36,14 +36,14 @@ def make_episode(
     """The ball (radius 5 cm) rolls 1 cm a step along x and turns with it; the plate lies still at z = 0."""
     rng = np.random.default_rng(seed)
     t = np.arange(steps)
-    centre = np.stack([-0.2 + 0.01 * t, np.full(steps, rng.uniform(0.4, 0.6)), np.full(steps, 0.05)], -1)
+    center = np.stack([-0.2 + 0.01 * t, np.full(steps, rng.uniform(0.4, 0.6)), np.full(steps, 0.05)], -1)
     c, s, o, one = np.cos(t / 5), np.sin(t / 5), 0.0 * t, 1 + 0.0 * t
     turn = np.stack([np.stack([c, o, s], -1), np.stack([o, one, o], -1), np.stack([-s, o, c], -1)], -2)
     on_ball = points // 2
     direction = rng.normal(size=(on_ball, 3))
     ball = 0.05 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     plate = np.append(rng.uniform([-0.4, 0.2], [0.4, 0.8], (points - on_ball, 2)), np.zeros((points - on_ball, 1)), 1)
-    moved = np.einsum("tij,mj->tmi", turn, ball) + centre[:, None]
+    moved = np.einsum("tij,mj->tmi", turn, ball) + center[:, None]
     cloud = np.concatenate([moved, np.broadcast_to(plate, (steps, *plate.shape))], 1).astype(np.float32)
     chosen = rng.integers(0, points, queries)
     tracks = cloud[:, chosen]
@@ -59,7 +59,7 @@ def make_episode(
         success=t >= steps - 5,
         queries=Queries(tracks[0], (chosen < on_ball).astype(np.int16), queries, ENTITIES),
         tracks=Tracks3D(tracks, rng.random((steps, queries)) < 0.9, np.zeros(queries, np.float32)),
-        object_pose=np.concatenate([centre, turn[..., 0], turn[..., 1]], -1).astype(np.float32)
+        object_pose=np.concatenate([center, turn[..., 0], turn[..., 1]], -1).astype(np.float32)
         if object_pose
         else None,
         depth=rng.uniform(0.5, 1, (steps, 12, 16)).astype(np.float32) if depth else None,
@@ -78,7 +78,7 @@ def make_receipt(episodes: Sequence[Episode], **changes: Any) -> Receipt:
         "accepted": tuple(e.seed for e in episodes),
         "frames": tuple(len(e) for e in episodes),
         "digests": tuple(episode_digest(e) for e in episodes),
-        "stats": stats.summarise(episodes),
+        "stats": stats.summarize(episodes),
     }
     return Receipt(**{**values, **changes})
 
@@ -106,7 +106,7 @@ def make_dataset(folder: Path, units: Iterable[Sequence[Episode]], **changes: An
         receipt = make_receipt(unit)
         write_shard(folder / receipt.shard, unit, manifest.settings_digest)
         keep_receipt(folder, receipt)
-    return summarise(folder)
+    return summarize(folder)
 
 
 def assert_same(a: Any, b: Any, where: str = "episode") -> None:
@@ -150,14 +150,14 @@ def call_cli(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tupl
 
 
 def with_quality(episode: Episode, seed: int = 0) -> Episode:
-    """The episode as if its tracks had been estimated: measured where visible, else modelled or filled."""
+    """The episode as if its tracks had been estimated: measured where visible, else modeled or filled."""
     rng = np.random.default_rng(seed)
     visible = episode.tracks.visible
     shape = visible.shape
-    hidden = rng.choice([Source.MODEL, Source.FILLED], shape)
+    hidden = rng.choice([PositionSource.MODEL, PositionSource.FILLED], shape)
     quality = Quality(
         sigma=rng.uniform(0.001, 0.02, shape).astype(np.float32),
-        source=np.where(visible, Source.MEASURED, hidden).astype(np.uint8),
+        source=np.where(visible, PositionSource.MEASURED, hidden).astype(np.uint8),
         depth_valid=visible | (rng.random(shape) < 0.1),
         forward_backward=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 2, shape)).astype(np.float32),
         disagreement=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 2, shape)).astype(np.float32),
@@ -172,7 +172,7 @@ LOOKING_ALONG_Y = np.array([[1.0, 0, 0, 0], [0, 0, 1, -1], [0, -1, 0, 0], [0, 0,
 def make_filmed_episode(T_world_cam: np.ndarray | None = None, *, steps: int = 12, seed: int = 3) -> Episode:
     """As if from a recording: roles are not known, and without a pose the world is the camera's frame.
 
-    Before a grey wall 1 m away, by point: 0 is sure and goes right by a pixel a step, 1 is unsure and goes
+    Before a gray wall 1 m away, by point: 0 is sure and goes right by a pixel a step, 1 is unsure and goes
     down, 2 was filled in, 3 is out of sight, 4 is behind the camera, and 5 repeats 4 wherever padding may lie.
     """
     camera = Camera.from_fovy(80, 60, 50.0, np.eye(4) if T_world_cam is None else T_world_cam)
@@ -183,7 +183,14 @@ def make_filmed_episode(T_world_cam: np.ndarray | None = None, *, steps: int = 1
     z = np.broadcast_to([1.0, 1, 1, 1, -1, 1], (steps, 6))
     tracks = camera.unproject(uv, z).astype(np.float32)
     visible = np.tile([True, True, False, False, False, True], (steps, 1))
-    source = [Source.MEASURED, Source.MEASURED, Source.FILLED, Source.MODEL, Source.MODEL, Source.MEASURED]
+    source = [
+        PositionSource.MEASURED,
+        PositionSource.MEASURED,
+        PositionSource.FILLED,
+        PositionSource.MODEL,
+        PositionSource.MODEL,
+        PositionSource.MEASURED,
+    ]
     unmeasured = np.full((steps, 6), -1, np.float32)
     quality = Quality(
         sigma=np.tile(np.array([0.001, 0.06, 0.02, 0.02, 0.02, 0], np.float32), (steps, 1)),
@@ -210,5 +217,5 @@ def make_filmed_episode(T_world_cam: np.ndarray | None = None, *, steps: int = 1
         tracks=Tracks3D(tracks, visible, np.zeros(6, np.float32), quality),
         depth=np.ones((steps, 60, 80), np.float32),
         rgb=rgb,
-        extras={"source": "pour-3", "tracker": {"tracker": "bodies", "licence": "Apache-2.0", "options": {}}},
+        extras={"source": "pour-3", "tracker": {"tracker": "rigid-bodies", "license": "Apache-2.0", "options": {}}},
     )

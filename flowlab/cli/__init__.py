@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from flowlab import __version__
 from flowlab.errors import FlowlabError
+from flowlab.version import __version__
 
 _COMMANDS = {
     "tasks": ("flowlab.cli.tasks:tasks", "List MetaWorld's 50 tasks."),
@@ -42,9 +42,9 @@ class _Commands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
-            from flowlab.errors import unknown
+            from flowlab.errors import unknown_name
 
-            ctx.fail(str(unknown("command", args[0], _COMMANDS)))
+            ctx.fail(str(unknown_name("command", args[0], _COMMANDS)))
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -12,7 +12,7 @@ from flowlab.cli.results import print_results
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
-    from flowlab.evaluation.results import Result
+    from flowlab.benchmark.results import PolicyResult
 
 
 @click.command()
@@ -53,9 +53,9 @@ def bench(
     Every policy is a unit of work, done by one process. Ended early, the same command does the rest: a unit is done
     once its result is in OUT/units, and neither runs nor datasets are needed for it then.
     """
+    from flowlab.benchmark import experiment
     from flowlab.cli.evaluate import numbers
-    from flowlab.evaluation import experiment
-    from flowlab.evaluation.report import write_report
+    from flowlab.report.html import write_report
 
     changes: dict[str, Any] = {
         "tasks": (*groups, *tasks) or None,
@@ -68,7 +68,7 @@ def bench(
     asked = experiment.load_experiment(recipe, **{k: v for k, v in changes.items() if v is not None})
     if variants is not None:
         asked = experiment.with_variants(asked, [] if variants == "none" else _names(variants))
-    units = experiment.plan(asked)
+    units = experiment.plan_units(asked)
     workers = workers or len(os.sched_getaffinity(0))
     if dry_run:
         hours = len(units) * asked.minutes / 60
@@ -81,7 +81,7 @@ def bench(
         return
     told: set[str] = set()
 
-    def show(results: Sequence["Result"], of: int) -> None:
+    def show(results: Sequence["PolicyResult"], of: int) -> None:
         fresh, before = [r for r in results if r.name not in told], bool(told)
         told.update(r.name for r in results)
         if as_json:

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from flowlab.learning.trainer import Progress as TrainingProgress
+    from flowlab.training.trainer import TrainingProgress
 
 console = Console(stderr=True)
 """For people: progress and logs. Results go to standard output."""

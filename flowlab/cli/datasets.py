@@ -60,7 +60,7 @@ def _numbers(values: list[float]) -> str:
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def validate(dataset: Path, as_json: bool) -> None:
     """Check a dataset: one line for each finding, exit code 3 if there is any."""
-    from flowlab.storage.validate import validate as findings_of
+    from flowlab.storage.validation import validate as findings_of
 
     findings = []
     for finding in findings_of(dataset):
@@ -86,7 +86,7 @@ def export(dataset: Path, layout: str, out: Path, task: str | None) -> None:
     dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads.
     """
     from flowlab.storage.dataset import Dataset
-    from flowlab.storage.export import export_dp3
+    from flowlab.storage.exporters.dp3 import export_dp3
 
     count = export_dp3(Dataset(dataset), out, task)
     click.echo(f"{count} episodes written to {out} for {layout}")

@@ -12,8 +12,8 @@ from flowlab.cli.results import print_results
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
-    from flowlab.evaluation.evaluate import Subject
-    from flowlab.evaluation.results import Result
+    from flowlab.benchmark.results import PolicyResult
+    from flowlab.evaluation.evaluate import CheckpointRef
 
 
 @click.command("eval")
@@ -66,14 +66,14 @@ def evaluate(
         return
     if data is not None:
         raise UsageError("--data is about held-out demonstrations; add --offline")
+    from flowlab.benchmark.collect import collect
     from flowlab.evaluation import evaluate as work
-    from flowlab.evaluation.collect import collect
     from flowlab.evaluation.trials import trials
 
     if checkpoints:
         subjects = [s for run in runs for s in work.find_checkpoints(run, execute)]
     else:
-        subjects = [work.find_subject(run, execute) for run in runs]
+        subjects = [work.find_checkpoint(run, execute) for run in runs]
     chosen = work.choose_tasks(subjects, tasks)
     wanted = trials(chosen, numbers(seeds), episodes)
     workers = workers or len(os.sched_getaffinity(0))
@@ -89,7 +89,7 @@ def evaluate(
     results = collect(subjects, evaluations)
     films_made = _film(subjects, results, films, out) if films else []
     if out is not None:
-        from flowlab.evaluation.report import write_report
+        from flowlab.report.html import write_report
 
         write_report(out, results, films=films_made)
     if as_json:
@@ -102,7 +102,9 @@ def evaluate(
         click.echo(f"{out / 'report.html'}, with report.json, report.csv and episodes.csv beside it")
 
 
-def _film(subjects: Sequence["Subject"], results: Sequence["Result"], count: int, out: Path | None) -> list[Path]:
+def _film(
+    subjects: Sequence["CheckpointRef"], results: Sequence["PolicyResult"], count: int, out: Path | None
+) -> list[Path]:
     """Films and recordings of the first successes and failures of every policy and task."""
     from flowlab.evaluation.replay import film
 
@@ -119,7 +121,7 @@ def _film(subjects: Sequence["Subject"], results: Sequence["Result"], count: int
 
 def _offline(runs: Sequence[Path], data: Path | None, as_json: bool) -> None:
     from flowlab.evaluation.offline import demonstration_rows, evaluate_offline, offline_rows
-    from flowlab.learning.checkpoint import load_policy
+    from flowlab.policies.checkpoint import load_policy
 
     reports = {run: evaluate_offline(load_policy(run), data) for run in runs}
     if as_json:

@@ -53,10 +53,11 @@ def extract_sim(
     """
     sys.path.insert(0, os.getcwd())  # a recipe's own stages may lie beside it
     try:
-        import flowlab.pipeline.stages  # noqa: F401 - MuJoCo comes with it
-        from flowlab.pipeline.engine import LocalEngine
+        import flowlab.pipeline.stages.simulation  # noqa: F401 - MuJoCo comes with it
+        from flowlab.engines.local import LocalEngine
+        from flowlab.pipeline.extraction import extract
         from flowlab.pipeline.recipe import load_recipe
-        from flowlab.pipeline.run import Progress, extract
+        from flowlab.pipeline.scheduling import ExtractionProgress
     except Exception as error:
         if "MUJOCO_GL" not in os.environ:
             raise
@@ -65,7 +66,7 @@ def extract_sim(
             f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
             "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
         ) from error
-    from flowlab.pipeline.units import Share
+    from flowlab.pipeline.units import JobShard
     from flowlab.sim.tasks import GROUPS, select_tasks
 
     changes = [*overrides, *([f"expert.scene.renderer={renderer}"] if renderer else [])]
@@ -74,14 +75,14 @@ def extract_sim(
     chosen = select_tasks([t for t in asked if t not in GROUPS], [*groups, *(t for t in asked if t in GROUPS)])
     if not chosen:
         raise UsageError("name the tasks to extract, as in 'flowlab extract-sim hammer push --out data/demo'")
-    share, workers = Share.parse(shard), workers or len(os.sched_getaffinity(0))
+    share, workers = JobShard.parse(shard), workers or len(os.sched_getaffinity(0))
     if dry_run:
         _dry_run(chosen_recipe, chosen, out, workers, as_json)
         return
     start = time.monotonic()
     with ProgressBar(quiet=as_json) as bar:
 
-        def show(progress: Progress) -> None:
+        def show(progress: ExtractionProgress) -> None:
             note = f"extracting ({progress.rejected} rejected)" if progress.rejected else "extracting"
             bar.update(progress.accepted, progress.wanted, note)
 
@@ -101,7 +102,7 @@ def extract_sim(
 
 def _dry_run(recipe: "Recipe", tasks: tuple[str, ...], out: Path, workers: int, as_json: bool) -> None:
     """Time one episode, write it nowhere, and say what the run would do."""
-    from flowlab.pipeline.run import estimate
+    from flowlab.pipeline.extraction import estimate
 
     plan = estimate(recipe, tasks, out, workers)
     if as_json:

@@ -11,19 +11,19 @@ import yaml
 from pydantic import ValidationError
 
 from flowlab.cli.console import console, print_json, print_table
-from flowlab.errors import DataError, FlowlabError, MissingLibraryError, UsageError, unknown
+from flowlab.errors import DataError, FlowlabError, MissingLibraryError, UsageError, unknown_name
 
 if TYPE_CHECKING:
-    from flowlab.pipeline.grading import Grade, Grades
-    from flowlab.pipeline.simulated import SimulatedRecording
-    from flowlab.tracking.chunks import ChunkSettings
-    from flowlab.tracking.metrics import Errors
-    from flowlab.tracking.tracker import Tracker
+    from flowlab.grading.grade import Grade, Grades
+    from flowlab.grading.metrics import TrackErrors
+    from flowlab.grading.simulate import SimulatedRecording
+    from flowlab.tracking.base import Tracker
+    from flowlab.tracking.chunking import ChunkSettings
 
 
 @click.command()
 @click.argument("recordings", nargs=-1, metavar="[RECORDING]...", type=click.Path(path_type=Path))
-@click.option("--tracker", "names", multiple=True, default=["bodies"], show_default=True, help="May be repeated.")
+@click.option("--tracker", "names", multiple=True, default=["rigid-bodies"], show_default=True, help="May be repeated.")
 @click.option("--tasks", default="", metavar="TASK,...", help="Simulate recordings of these tasks.")
 @click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="Recordings of each task.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the first recording.")
@@ -55,8 +55,8 @@ def grade(
     """Label recordings whose truth is known, without looking at it, and say how far off the labels are.
 
     \b
-      flowlab grade --tracker bodies --tasks hammer,door-open
-      flowlab grade rec/sample --tracker bodies --tracker lucas-kanade --out graded
+      flowlab grade --tracker rigid-bodies --tasks hammer,door-open
+      flowlab grade rec/sample --tracker rigid-bodies --tracker lucas-kanade --out graded
 
     A RECORDING is a folder with a ground_truth.npz, or holds such folders. With --tasks, MetaWorld's experts
     are recorded by a simulated depth camera; the recordings are kept in OUT/recordings, and used again by the
@@ -65,8 +65,8 @@ def grade(
     if not recordings and not tasks:
         raise UsageError("nothing to grade; give folders with a ground_truth.npz, or --tasks hammer,door-open")
     _import_simulation()
-    from flowlab.pipeline.grading import grade as grade_all
-    from flowlab.tracking.lift import LiftSettings
+    from flowlab.grading.grade import grade as grade_all
+    from flowlab.tracking.lifting import LiftSettings
 
     chunks, settings = _chunk_settings(chunk, stride), _recording_settings(sensor, size)
     trackers = [_make_tracker(name, names, changes, weights) for name in dict.fromkeys(names)]
@@ -84,7 +84,7 @@ def grade(
     folders = list({folder.resolve(): folder for folder in folders}.values())
     results = []
     for tracker in trackers:
-        say(f"labelling with {tracker.name}")
+        say(f"labeling with {tracker.name}")
         results.append(grade_all(folders, tracker, chunks, LiftSettings(), report=report))
     document = {
         "chunks": chunks.model_dump(mode="json"),
@@ -101,8 +101,8 @@ def grade(
 
 
 def _write(out: Path, results: Sequence["Grades"], document: dict[str, Any]) -> None:
-    from flowlab.storage.files import write_json
-    from flowlab.viz.grade_picture import draw_grades
+    from flowlab.files import write_json
+    from flowlab.viz.grade_figure import draw_grades
 
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "grade.json", document)
@@ -125,7 +125,7 @@ def _import_simulation() -> None:
 
 def _chunk_settings(chunk: int | None, stride: int | None) -> "ChunkSettings":
     """The defaults, but for what is asked for."""
-    from flowlab.tracking.chunks import ChunkSettings
+    from flowlab.tracking.chunking import ChunkSettings
 
     asked = {"length": chunk, "stride": stride}
     try:
@@ -136,7 +136,7 @@ def _chunk_settings(chunk: int | None, stride: int | None) -> "ChunkSettings":
 
 def _make_tracker(name: str, names: Sequence[str], changes: Sequence[str], weights: Path | None) -> "Tracker":
     """A tracker with the options that are meant for it: those without a tracker's name are for all."""
-    from flowlab.tracking.tracker import make_tracker
+    from flowlab.tracking.base import make_tracker
 
     options: dict[str, Any] = {} if weights is None else {"weights": str(weights)}
     for change in changes:
@@ -145,7 +145,7 @@ def _make_tracker(name: str, names: Sequence[str], changes: Sequence[str], weigh
         if not equals or not option:
             raise UsageError(f"--set {change}: must look like KEY=VALUE, or {names[0]}.KEY=VALUE for one tracker")
         if whose and whose not in names:
-            raise UsageError(f"--set {change}: {unknown('tracker of this run', whose, names)}")
+            raise UsageError(f"--set {change}: {unknown_name('tracker of this run', whose, names)}")
         if whose in ("", name):
             try:
                 options[option] = yaml.safe_load(value)
@@ -156,7 +156,7 @@ def _make_tracker(name: str, names: Sequence[str], changes: Sequence[str], weigh
 
 def _find(path: Path) -> list[Path]:
     """The recordings with known truth at or below a path."""
-    from flowlab.tracking.ground_truth import FILE_NAME
+    from flowlab.grading.ground_truth import FILE_NAME
 
     if not path.exists():
         raise DataError(f"{path}: there is no such folder")
@@ -170,7 +170,7 @@ def _find(path: Path) -> list[Path]:
 
 
 def _recording_settings(sensor: str, size: str) -> "SimulatedRecording":
-    from flowlab.pipeline.simulated import SimulatedRecording
+    from flowlab.grading.simulate import SimulatedRecording
     from flowlab.sim.sensor import PRESETS
 
     width, times, height = size.partition("x")
@@ -187,7 +187,7 @@ def _simulate(
     tasks: str, seeds: range, settings: "SimulatedRecording", out: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """Record what is not there yet."""
-    from flowlab.pipeline.simulated import simulate_recording
+    from flowlab.grading.simulate import simulate_recording
     from flowlab.sim.tasks import GROUPS, select_tasks
 
     asked = [name for name in tasks.replace(" ", "").split(",") if name]
@@ -230,7 +230,7 @@ def _print(results: Sequence["Grades"]) -> None:
         click.echo(f"not graded, because the sensor's first depth there is not that of the surface: {each} queries")
 
 
-def _error_figures(errors: "Errors") -> list[object]:
+def _error_figures(errors: "TrackErrors") -> list[object]:
     shares = errors.within_5mm, errors.within_10mm, errors.within_20mm, errors.within_40mm
     return [round(errors.median_mm, 1), round(errors.p95_mm, 1), *(round(s, 2) for s in shares)]
 

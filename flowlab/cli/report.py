@@ -24,10 +24,10 @@ def report(sources: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     A SOURCE is the folder of a bench, a run that `flowlab eval` has evaluated, or a CSV file of trials on a robot that
     somebody scored, with the columns policy, task, trial, success.
     """
-    from flowlab.evaluation.collect import gather
-    from flowlab.evaluation.report import write_report
-    from flowlab.evaluation.scored import read_scored, scored_rows
-    from flowlab.evaluation.summary import summarise
+    from flowlab.benchmark.collect import gather
+    from flowlab.benchmark.robot_trials import read_robot_trials, robot_trial_tables
+    from flowlab.benchmark.summary import summarize
+    from flowlab.report.html import write_report
 
     tables = [source for source in sources if source.suffix == ".csv"]
     folders = [source for source in sources if source.suffix != ".csv"]
@@ -35,14 +35,14 @@ def report(sources: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
         if len(sources) != 1 or tables:
             raise UsageError("--out: say where to write the report, as in --out results/robot")
         out = sources[0]
-    scored = [trial for table in tables for trial in read_scored(table)]
+    scored = [trial for table in tables for trial in read_robot_trials(table)]
     results = gather(folders)
     write_report(out, results, scored=scored)
     if as_json:
-        print_json(summarise(results).model_dump(mode="json"))
+        print_json(summarize(results).model_dump(mode="json"))
         return
     if results:
         print_results(results)
-    for title, columns, rows in scored_rows(scored) if scored else []:
+    for title, columns, rows in robot_trial_tables(scored) if scored else []:
         print_table(columns, rows, title)
     click.echo(f"{out / 'report.html'}, with report.json, report.csv and episodes.csv beside it")

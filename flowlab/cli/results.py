@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 from flowlab.cli.console import print_table
 
 if TYPE_CHECKING:
-    from flowlab.evaluation.results import Result
-    from flowlab.evaluation.statistics import Share
+    from flowlab.benchmark.results import PolicyResult
+    from flowlab.benchmark.statistics import Proportion
 
 
-def print_results(results: Sequence["Result"]) -> None:
+def print_results(results: Sequence["PolicyResult"]) -> None:
     """Success by policy and task, policies against each other, and how well motion was foreseen."""
-    from flowlab.evaluation.summary import ALL, summarise
+    from flowlab.benchmark.summary import ALL, summarize
 
-    summary = summarise(results)
+    summary = summarize(results)
     rows = [
         [s.task, s.label, *_share(s.success), _percent(s.success_dp3), s.mean_steps or "-"] for s in summary.successes
     ]
@@ -57,10 +57,10 @@ def print_results(results: Sequence["Result"]) -> None:
         print_table(columns, flow, "predicted against true flow of moving points, while a plan is executed")
 
 
-def _share(share: "Share") -> list[object]:
+def _share(share: "Proportion") -> list[object]:
     interval = f"{100 * share.low:.0f} - {100 * share.high:.0f}"
     return [share.successes, share.n, _percent(share), interval]
 
 
-def _percent(share: "Share") -> float:
+def _percent(share: "Proportion") -> float:
     return round(100 * share.share, 1)

@@ -14,9 +14,9 @@ from flowlab.cli.console import ProgressBar, console, print_json
 from flowlab.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from flowlab.pipeline.real_run import Forecast
+    from flowlab.pipeline.labeling import CostEstimate
     from flowlab.pipeline.recipe import Recipe
-    from flowlab.pipeline.units import Share
+    from flowlab.pipeline.units import JobShard
     from flowlab.storage.recorded import Recorded
 
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the dataset; not needed for --dry-run.")
 @click.option("--task", help="Task of all these recordings [what they say, or the name of their folder].")
-@click.option("--tracker", help="Short for --set track.tracker=NAME [the recipe's: bodies].")
+@click.option("--tracker", help="Short for --set track.tracker=NAME [the recipe's: rigid-bodies].")
 @click.option("--chunk", type=click.IntRange(min=1), help="Frames to a chunk [the recipe's: 33].")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next [the recipe's: 8].")
 @click.option("--weights", type=click.Path(path_type=Path), help="File with a learned tracker's weights.")
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
-@click.option("--dry-run", is_flag=True, help="Say what is recognised and how long it would take; write nothing.")
+@click.option("--dry-run", is_flag=True, help="Say what is recognized and how long it would take; write nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def track_real(
     paths: tuple[Path, ...],
@@ -61,9 +61,9 @@ def track_real(
     An existing dataset with the same settings is continued or extended; recordings that are new get new numbers.
     """
     sys.path.insert(0, os.getcwd())  # a recipe's own stages may lie beside it
-    from flowlab.pipeline.real_run import find
+    from flowlab.pipeline.labeling import find_jobs
     from flowlab.pipeline.recipe import load_recipe
-    from flowlab.pipeline.units import Share
+    from flowlab.pipeline.units import JobShard
 
     short = {
         "track.tracker": tracker,
@@ -74,10 +74,10 @@ def track_real(
     }
     changes = [f"{key}={json.dumps(str(v) if isinstance(v, Path) else v)}" for key, v in short.items() if v is not None]
     chosen = load_recipe(recipe, [*overrides, *changes])
-    share, workers = Share.parse(shard), workers or len(os.sched_getaffinity(0))
+    share, workers = JobShard.parse(shard), workers or len(os.sched_getaffinity(0))
     if out is None and not dry_run:
         raise UsageError("name the folder of the dataset, as in --out data/pour; or look first with --dry-run")
-    recordings = find(chosen, paths, task)
+    recordings = find_jobs(chosen, paths, task)
     if out is None or dry_run:
         _dry_run(chosen, recordings, workers, as_json)
     else:
@@ -85,22 +85,22 @@ def track_real(
 
 
 def _label(
-    recipe: "Recipe", recordings: "tuple[Recorded, ...]", out: Path, share: "Share", workers: int, as_json: bool
+    recipe: "Recipe", recordings: "tuple[Recorded, ...]", out: Path, share: "JobShard", workers: int, as_json: bool
 ) -> None:
     from flowlab.cli.reports import extraction_report, print_extraction
-    from flowlab.pipeline.engine import LocalEngine
-    from flowlab.pipeline.plans import Progress
-    from flowlab.pipeline.real_run import track_recordings
+    from flowlab.engines.local import LocalEngine
+    from flowlab.pipeline.labeling import label_recordings
+    from flowlab.pipeline.scheduling import ExtractionProgress
 
     start = time.monotonic()
-    engine = partial(LocalEngine, workers=workers, imports=["flowlab.pipeline.real_stages"])
+    engine = partial(LocalEngine, workers=workers, imports=["flowlab.pipeline.stages.recording"])
     with ProgressBar(quiet=as_json) as bar:
 
-        def show(progress: Progress) -> None:
-            note = f"labelling ({progress.rejected} rejected)" if progress.rejected else "labelling"
+        def show(progress: ExtractionProgress) -> None:
+            note = f"labeling ({progress.rejected} rejected)" if progress.rejected else "labeling"
             bar.update(progress.accepted + progress.rejected, progress.wanted, note)
 
-        dataset = track_recordings(recipe, recordings, out, start_engine=engine, share=share, report=show)
+        dataset = label_recordings(recipe, recordings, out, start_engine=engine, share=share, report=show)
     report = extraction_report(dataset, time.monotonic() - start)
     if as_json:
         print_json(report)
@@ -111,16 +111,16 @@ def _label(
 
 
 def _dry_run(recipe: "Recipe", recordings: "tuple[Recorded, ...]", workers: int, as_json: bool) -> None:
-    """Say what is recognised of every recording, and how long labelling would take."""
-    from flowlab.cli.recognised import facts_of, lines_of
-    from flowlab.pipeline.real_run import forecast, look
+    """Say what is recognized of every recording, and how long labeling would take."""
+    from flowlab.cli.inspected import facts_of, lines_of
+    from flowlab.pipeline.labeling import estimate_cost, inspect_recording
 
     rows: list[dict[str, Any]] = []
     for one in recordings:
-        rows.append({"recording": one.source, "task": one.task} | facts_of(look(recipe, one)))
+        rows.append({"recording": one.source, "task": one.task} | facts_of(inspect_recording(recipe, one)))
         if not as_json:
             click.echo("\n".join(lines_of(rows[-1])))
-    plan = _plan(forecast(recipe, recordings), rows, workers)
+    plan = _plan(estimate_cost(recipe, recordings), rows, workers)
     if as_json:
         print_json({"recordings": rows} | plan)
     else:
@@ -131,8 +131,8 @@ def _dry_run(recipe: "Recipe", recordings: "tuple[Recorded, ...]", workers: int,
         raise DataError(f"{problems} of {len(rows)} recordings cannot be used as they are; see above")
 
 
-def _plan(cost: "Forecast", rows: list[dict[str, Any]], workers: int) -> dict[str, Any]:
-    """How long labelling what can be labelled would take."""
+def _plan(cost: "CostEstimate", rows: list[dict[str, Any]], workers: int) -> dict[str, Any]:
+    """How long labeling what can be labeled would take."""
     frames = sum(row["rows"] for row in rows if row["problem"] is None)
     seconds = cost.cpu_s_per_frame
     return {

@@ -13,7 +13,7 @@ from flowlab.cli.console import TrainingBar, console, print_json, print_table
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
-    from flowlab.learning.trainer import Trainer
+    from flowlab.training.trainer import Trainer
 
 
 @click.command()
@@ -76,25 +76,27 @@ def train(
             f"say what to train and where to keep it, as in 'flowlab train {source} --policy fdp --out runs/fdp'; "
             "--resume goes on with a run"
         )
-    from flowlab.learning import runs
-    from flowlab.learning.settings import load_settings
+    from flowlab.policies.settings import load_settings
+    from flowlab.training import run
 
     asked_for = {"device": device, "threads": threads, "precision": precision, "logs": logs or None}
     machine = {name: value for name, value in asked_for.items() if value is not None}
     if resume:
-        trainer = runs.resume(source, **machine)
+        trainer = run.resume_run(source, **machine)
     else:
         assert policy is not None
         assert out is not None
         changes = [f"run.minutes={minutes}", "run.steps=null"] if minutes else []
         changes += [f"run.seed={seed}"] if seed is not None else []
         settings = load_settings(profile or "fast", policy, [*overrides, *changes])
-        trainer = runs.prepare(source, out, settings, runs.Machine(**machine), overfit=overfit, began_from=began_from)
+        trainer = run.prepare_run(
+            source, out, settings, run.ComputeSettings(**machine), overfit=overfit, began_from=began_from
+        )
     first = trainer.processes.is_first
     if first and not as_json:
         _describe(trainer)
     with TrainingBar(quiet=as_json or not first) as bar, _stop_on_signal() as asked:
-        finished = runs.run(trainer, bar.update, lambda: bool(asked))
+        finished = run.run(trainer, bar.update, lambda: bool(asked))
     if first:
         _finish(trainer, finished, as_json)
     if not finished:
@@ -112,7 +114,7 @@ def _describe(trainer: "Trainer") -> None:
         highlight=False,
         soft_wrap=True,
     )
-    if spec.settings.encoder.relative and spec.layout.gripper is None:
+    if spec.settings.encoder.relative and spec.channels.gripper is None:
         console.print(
             "points are given in the world frame: the data do not tell where in it the gripper is",
             highlight=False,
@@ -122,9 +124,9 @@ def _describe(trainer: "Trainer") -> None:
 
 def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
     """Draw the curve, and print what came out."""
-    from flowlab.learning.checkpoint import room_to_write
-    from flowlab.learning.metrics import METRICS, last_of
-    from flowlab.viz.curve import draw_curve
+    from flowlab.policies.checkpoint import writing_run
+    from flowlab.training.metrics import METRICS, last_metrics
+    from flowlab.viz.curve_figure import draw_curve
 
     folder = trainer.folder
     metrics = folder / METRICS
@@ -134,11 +136,11 @@ def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
         "step": trainer.step,
         "steps": trainer.run.steps,
         "finished": finished,
-        "training": last_of(metrics, "train"),
-        "validation": last_of(metrics, "validation"),
+        "training": last_metrics(metrics, "train"),
+        "validation": last_metrics(metrics, "validation"),
     }
     if report["training"] or report["validation"]:
-        with room_to_write(folder):
+        with writing_run(folder):
             draw_curve(metrics, folder / "curve.png")
     if as_json:
         print_json(report)

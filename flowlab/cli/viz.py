@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from flowlab.records import Episode, Foreseen
+    from flowlab.records import Episode, FlowPrediction
     from flowlab.storage.dataset import Dataset, EpisodeRef, RejectRef
 
 
@@ -47,7 +47,7 @@ def viz(
       flowlab viz runs/push-fdp --task push --seed 3
 
     SOURCE is a dataset, or a RUN of `flowlab train` (or one of its checkpoints), which tries the episode that
-    `flowlab eval` gives this number. Tracks that were estimated are coloured by their stated error, exact ones by what
+    `flowlab eval` gives this number. Tracks that were estimated are colored by their stated error, exact ones by what
     they lie on. With none of --save, --png and --mp4, a recording is written beside you.
     """
     from flowlab.errors import UsageError
@@ -70,15 +70,15 @@ def viz(
         from flowlab.viz.video import write_video
 
         with _writing(mp4):
-            write_video(shown.episode, mp4, fps=fps, title=shown.name, note=shown.note, foreseen=shown.foreseen)
+            write_video(shown.episode, mp4, fps=fps, title=shown.name, note=shown.note, prediction=shown.prediction)
         click.echo(f"{shown.name}: {mp4}")
     if save is not None or (png is None and mp4 is None):
-        from flowlab.viz.recording import write_recording
+        from flowlab.viz.recording import write_rrd
 
         save = save or Path(f"{shown.episode.task}-{shown.episode.seed:06d}.rrd")
         name = f"{shown.name} (rejected)" if rejects else shown.name
         with _writing(save):
-            write_recording(shown.episode, save, name=name, about=shown.about, foreseen=shown.foreseen)
+            write_rrd(shown.episode, save, name=name, about=shown.about, prediction=shown.prediction)
         click.echo(f"{shown.name}: {save}; open it with: rerun {save}")
 
 
@@ -92,7 +92,7 @@ class _Shown:
     """Why it was kept out of its dataset, if it was."""
     about: str
     """Markdown for the recording's info panel."""
-    foreseen: "Foreseen | None" = None
+    prediction: "FlowPrediction | None" = None
 
 
 def _stored(source: Path, episode: int, task: str | None, rejects: bool) -> _Shown:
@@ -108,31 +108,31 @@ def _stored(source: Path, episode: int, task: str | None, rejects: bool) -> _Sho
 def _tried(run: Path, task: str | None, seed: int, episode: int) -> _Shown:
     """An episode that a policy tries now."""
     from flowlab.errors import UsageError
-    from flowlab.evaluation.evaluate import choose_tasks, find_subject
+    from flowlab.evaluation.evaluate import choose_tasks, find_checkpoint
     from flowlab.evaluation.replay import replay
     from flowlab.evaluation.trials import check_unseen, trials
 
-    subject = find_subject(run)
+    subject = find_checkpoint(run)
     tasks = choose_tasks([subject], [task] if task else [])
     if len(tasks) > 1:
         raise UsageError(f"{run}: knows several tasks; add --task, one of {', '.join(tasks)}")
     trial = trials(tasks, [seed], episode + 1)[-1]
-    check_unseen([trial], subject.trained.layouts, run)
-    shown, foreseen, outcome = replay(subject, trial)
+    check_unseen([trial], subject.trained.scene_seeds, run)
+    shown, prediction, outcome = replay(subject, trial)
     how = f"solved at step {outcome.steps}" if outcome.success else f"not solved in {outcome.steps} steps"
     name = f"{subject.run.name}: {trial.task}, seed {seed}, episode {episode}, {how}"
-    return _Shown(shown, name, "", f"{subject.weights}, layout {trial.layout}", foreseen)
+    return _Shown(shown, name, "", f"{subject.weights}, layout {trial.scene_seed}", prediction)
 
 
 def _draw(shown: _Shown, png: Path) -> None:
-    if shown.foreseen is None:
+    if shown.prediction is None:
         from flowlab.viz.still import draw_still
 
         draw_still(shown.episode, png, title=shown.name, note=shown.note)
         return
-    from flowlab.viz.foreseen import draw_foreseen
+    from flowlab.viz.flow_prediction import draw_flow_prediction
 
-    draw_foreseen(shown.episode, shown.foreseen, png, title=shown.name)
+    draw_flow_prediction(shown.episode, shown.prediction, png, title=shown.name)
 
 
 def _accepted(data: "Dataset", episode: int, task: str | None) -> "Episode":

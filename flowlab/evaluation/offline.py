@@ -9,24 +9,24 @@ import numpy as np
 import torch
 
 from flowlab.config import Settings
+from flowlab.data.batches import Batch, BatchBuilder, ObservationBatch, WindowIndex, choose_queries, index_windows
+from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
+from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.errors import DataError
-from flowlab.evaluation.guesses import FlowGuesses, Pairs, pool
+from flowlab.evaluation.flow_metrics import FlowErrors, PointStepErrors, pool_errors
 from flowlab.geometry.camera import Camera
-from flowlab.learning.batches import Batch, Context, Gatherer, Windows, all_windows, choose_queries
-from flowlab.learning.checkpoint import RUN, Loaded, Run, Trained, check_observer, read_run
-from flowlab.learning.corpus import Corpus, load_corpus
-from flowlab.learning.policy import PolicyNetwork, PolicySpec
-from flowlab.learning.source import Source, open_source
-from flowlab.learning.validation import constant_motion, portions, true_motion, validate
+from flowlab.policies.base import PolicyNetwork, PolicySpec
+from flowlab.policies.checkpoint import RUN, LoadedPolicy, RunConfig, TrainedPolicy, check_observer, read_run_config
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.shard import Shard
+from flowlab.training.validation import constant_motion, portions, true_motion, validate
 
 DRAWS = 10
 """Predictions of every window's flow, each from other noise."""
 
 
-class Errors(Settings):
-    """As :func:`~flowlab.learning.validation.validate` defines them. None where there is no such prediction, or no
+class OfflineErrors(Settings):
+    """As :func:`~flowlab.training.validation.validate` defines them. None where there is no such prediction, or no
     last step to go by (``hold``, ``constant``)."""
 
     action_l1: float | None = None
@@ -43,18 +43,18 @@ class Errors(Settings):
     pose_mm_constant: float | None = None
 
 
-class Measured(Settings):
+class ErrorSummary(Settings):
     """Errors on one demonstration, or on all."""
 
     windows: int
     """Plans that are asked for; of more than 256, so many are made, evenly spaced."""
-    errors: Errors
-    flow: FlowGuesses | None
+    errors: OfflineErrors
+    flow: FlowErrors | None
     """None for policies that predict none, and where nothing moves. Of all demonstrations, distances are over all
     pairs, and TAPVid-3D's figures are means over the demonstrations, weighted by the pairs that are seen."""
 
 
-class DemoMeasured(Measured):
+class DemonstrationErrors(ErrorSummary):
     """Errors on one demonstration."""
 
     task: str
@@ -69,11 +69,11 @@ class OfflineReport(Settings):
     step: int
     """Training steps that its weights have seen."""
     dataset: str
-    demonstrations: tuple[DemoMeasured, ...]
-    all: Measured
+    demonstrations: tuple[DemonstrationErrors, ...]
+    all: ErrorSummary
 
 
-def evaluate_offline(loaded: Loaded, data: Path | None = None) -> OfflineReport:
+def evaluate_offline(loaded: LoadedPolicy, data: Path | None = None) -> OfflineReport:
     """Errors on the demonstrations that a policy's run held out; or on those of another dataset, but for layouts of
     the simulation that the policy was trained on.
 
@@ -82,20 +82,20 @@ def evaluate_offline(loaded: Loaded, data: Path | None = None) -> OfflineReport:
     run = loaded.path.absolute().parents[1]
     source = _open(loaded, run, data)
     check_observer(loaded.trained, run, source)
-    corpus = load_corpus(source, run)
-    _check_fit(loaded.policy.spec, corpus, source.path)
-    corpus = _only(corpus, _unseen(loaded, run, source, corpus))
-    judge = _Judge(loaded.policy, corpus, _cameras(source.path, corpus) if source.settings else None)
-    each = [judge.measure(k) for k in range(len(corpus.demos))]
+    buffer = load_buffer(source, run)
+    _check_fit(loaded.policy.spec, buffer, source.path)
+    buffer = _only(buffer, _unseen(loaded, run, source, buffer))
+    judge = _OfflineEvaluator(loaded.policy, buffer, _cameras(source.path, buffer) if source.settings else None)
+    each = [judge.measure(k) for k in range(len(buffer.demos))]
     return OfflineReport(
         policy=loaded.policy.spec.settings.policy,
         step=loaded.step,
         dataset=str(source.path),
         demonstrations=tuple(each),
-        all=Measured(
+        all=ErrorSummary(
             windows=sum(m.windows for m in each),
             errors=judge.errors(range(len(each))),
-            flow=pool([m.flow for m in each if m.flow is not None]),
+            flow=pool_errors([m.flow for m in each if m.flow is not None]),
         ),
     )
 
@@ -143,20 +143,20 @@ def demonstration_rows(report: OfflineReport) -> tuple[list[str], list[list[obje
     return [columns[k] for k in kept], [["-" if row[k] is None else row[k] for k in kept] for row in rows]
 
 
-class _Judge:
+class _OfflineEvaluator:
     """Compares a policy's plans with what was demonstrated."""
 
-    def __init__(self, policy: PolicyNetwork, corpus: Corpus, cameras: Sequence[Camera] | None) -> None:
-        self._policy, self._corpus, self._cameras = policy, corpus, cameras
+    def __init__(self, policy: PolicyNetwork, buffer: ReplayBuffer, cameras: Sequence[Camera] | None) -> None:
+        self._policy, self._buffer, self._cameras = policy, buffer, cameras
         s, spec = policy.spec.settings, policy.spec
-        self._gatherer = Gatherer(corpus, spec.layout, s, spec.tasks)
+        self._builder = BatchBuilder(buffer, spec.channels, s, spec.tasks)
         self._device = next(policy.parameters()).device
-        self._columns = choose_queries(corpus, s.motion) if s.policy == "fdp" else None
+        self._columns = choose_queries(buffer, s.motion) if s.policy == "fdp" else None
 
-    def measure(self, demo: int) -> DemoMeasured:
+    def measure(self, demo: int) -> DemonstrationErrors:
         """All errors on one demonstration."""
-        about = self._corpus.demos[demo]
-        return DemoMeasured(
+        about = self._buffer.demos[demo]
+        return DemonstrationErrors(
             task=about.task,
             seed=about.seed,
             windows=len(self._windows([demo]).now),
@@ -164,29 +164,31 @@ class _Judge:
             flow=None if self._columns is None else self._flow(demo),
         )
 
-    def errors(self, demos: Sequence[int]) -> Errors:
+    def errors(self, demos: Sequence[int]) -> OfflineErrors:
         """The errors that training looks at, too."""
-        return Errors(**validate(self._policy, self._gatherer, self._windows(demos), self._device))
+        return OfflineErrors(**validate(self._policy, self._builder, self._windows(demos), self._device))
 
-    def _windows(self, demos: Sequence[int]) -> Windows:
-        return all_windows(self._corpus, list(demos), self._policy.spec.settings.executed)
+    def _windows(self, demos: Sequence[int]) -> WindowIndex:
+        return index_windows(self._buffer, list(demos), self._policy.spec.settings.n_action_steps)
 
-    def _flow(self, demo: int) -> FlowGuesses | None:
+    def _flow(self, demo: int) -> FlowErrors | None:
         generator = torch.Generator().manual_seed(0)
-        parts: list[Pairs] = []
+        parts: list[PointStepErrors] = []
         first = 0
         for windows in portions(self._windows([demo])):
             parts.append(self._pairs(windows, generator, first))
             first += len(windows.now)
-        pairs = Pairs(**{f.name: np.concatenate([getattr(p, f.name) for p in parts], -1) for f in fields(Pairs)})
-        history = self._policy.spec.settings.history
+        pairs = PointStepErrors(
+            **{f.name: np.concatenate([getattr(p, f.name) for p in parts], -1) for f in fields(PointStepErrors)}
+        )
+        history = self._policy.spec.settings.n_obs_steps
         camera = None if self._cameras is None else self._cameras[demo]
-        return pairs.judged(camera, has_past=history > 1) if len(pairs.window) else None
+        return pairs.compute(camera, has_past=history > 1) if len(pairs.window) else None
 
-    def _pairs(self, windows: Windows, generator: torch.Generator, first: int) -> Pairs:
+    def _pairs(self, windows: WindowIndex, generator: torch.Generator, first: int) -> PointStepErrors:
         """Predict the flow of some windows several times, and compare it; the windows are numbered from ``first``."""
-        batch = self._gatherer.gather(windows).to(self._device)
-        now = self._policy.spec.settings.history - 1
+        batch = self._builder.build(windows).to(self._device)
+        now = self._policy.spec.settings.n_obs_steps - 1
         true, known, moving = true_motion(batch, now)
         predicted = self._policy.plan(_repeated(batch, DRAWS), generator).flow
         assert predicted is not None
@@ -199,7 +201,7 @@ class _Judge:
         def off(guess: torch.Tensor) -> np.ndarray:
             return (guess - true).norm(dim=-1)[..., counted].double().cpu().numpy()
 
-        return Pairs(
+        return PointStepErrors(
             policy=off(drawn),
             zero=off(torch.zeros_like(true)[None]),
             constant=off(constant_motion(batch, now)[None]),
@@ -209,18 +211,18 @@ class _Judge:
             xyz_world=xyz_world[mask].T,
         )
 
-    def _labels(self, windows: Windows, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    def _labels(self, windows: WindowIndex, steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Where the query points are after 1, 2, ... actions (W, K, M, 3) [m], and whether they are seen (W, K, M)."""
         assert self._columns is not None
-        stop = np.array([d.stop for d in self._corpus.demos])[windows.demo]
+        stop = np.array([d.stop for d in self._buffer.demos])[windows.demo]
         row = np.minimum(windows.now[:, None] + np.arange(1, steps + 1), stop[:, None] - 1)
         column = self._columns[windows.demo][:, None]
-        return self._corpus.tracks[row[..., None], column], self._corpus.visible[row[..., None], column]
+        return self._buffer.tracks[row[..., None], column], self._buffer.visible[row[..., None], column]
 
 
-def _repeated(batch: Batch, times: int) -> Context:
+def _repeated(batch: Batch, times: int) -> ObservationBatch:
     """The windows of a batch several times over; frames are still encoded once."""
-    return Context(
+    return ObservationBatch(
         points=batch.points,
         state=batch.state,
         observed=batch.observed.repeat(times, 1),
@@ -229,14 +231,14 @@ def _repeated(batch: Batch, times: int) -> Context:
     )
 
 
-def _open(loaded: Loaded, run: Path, data: Path | None) -> Source:
+def _open(loaded: LoadedPolicy, run: Path, data: Path | None) -> TrainingSource:
     """The dataset that is given, or the run's own, which must be what it was."""
     if data is not None:
-        return open_source(data)
+        return open_training_source(data)
     path = _read_plan(run).dataset
     if not path.exists():
         raise DataError(f"{run}: its dataset is no longer at {path}; give where it is now with --data")
-    source = open_source(path)
+    source = open_training_source(path)
     if source.fingerprint != loaded.trained.fingerprint:
         raise DataError(
             f"{run}: was trained on content {loaded.trained.fingerprint} of {path}, now {source.fingerprint}; restore "
@@ -245,33 +247,33 @@ def _open(loaded: Loaded, run: Path, data: Path | None) -> Source:
     return source
 
 
-def _read_plan(run: Path) -> Run:
+def _read_plan(run: Path) -> RunConfig:
     """Which demonstrations were trained on, and which held out."""
     if not (run / RUN).exists():
         raise DataError(
             f"{run}: does not tell which demonstrations were held out (it has no {RUN}); restore it, or give another "
             "dataset with --data"
         )
-    return read_run(run)
+    return read_run_config(run)
 
 
-def _check_fit(spec: PolicySpec, corpus: Corpus, where: Path) -> None:
+def _check_fit(spec: PolicySpec, buffer: ReplayBuffer, where: Path) -> None:
     """Refuse a dataset whose state or action is another than the policy's, or that lacks what it predicts."""
     for name, wanted, found in (
-        ("state", spec.state_width, corpus.state.shape[1]),
-        ("action", spec.action_width, corpus.action.shape[1]),
+        ("state", spec.state_width, buffer.state.shape[1]),
+        ("action", spec.action_width, buffer.action.shape[1]),
     ):
         if found != wanted:
             raise DataError(f"{where}: '{name}' is {found} wide, and {wanted} in what the policy was trained on")
-    if spec.settings.policy == "mba" and corpus.object_pose.shape[1] != 9:
+    if spec.settings.policy == "mba" and buffer.object_pose.shape[1] != 9:
         raise DataError(f"{where}: has no object poses, which mba predicts; evaluate it on a dataset that has them")
-    if not set(spec.tasks) & set(corpus.tasks):
+    if not set(spec.tasks) & set(buffer.tasks):
         raise DataError(
-            f"{where}: has the tasks {', '.join(corpus.tasks)}, and the policy was trained on {', '.join(spec.tasks)}"
+            f"{where}: has the tasks {', '.join(buffer.tasks)}, and the policy was trained on {', '.join(spec.tasks)}"
         )
 
 
-def _unseen(loaded: Loaded, run: Path, source: Source, corpus: Corpus) -> list[int]:
+def _unseen(loaded: LoadedPolicy, run: Path, source: TrainingSource, buffer: ReplayBuffer) -> list[int]:
     """Positions of the demonstrations that the policy knows the task of, and was not trained on."""
     if source.fingerprint == loaded.trained.fingerprint:
         planned = _read_plan(run)
@@ -282,8 +284,8 @@ def _unseen(loaded: Loaded, run: Path, source: Source, corpus: Corpus) -> list[i
             "with --data"
         )
     known = _known_layouts(loaded.trained, run, source)
-    of_tasks = [k for k, d in enumerate(corpus.demos) if d.task in loaded.trained.policy.tasks]
-    if found := [k for k in of_tasks if (corpus.demos[k].task, corpus.demos[k].seed) not in known]:
+    of_tasks = [k for k, d in enumerate(buffer.demos) if d.task in loaded.trained.policy.tasks]
+    if found := [k for k in of_tasks if (buffer.demos[k].task, buffer.demos[k].seed) not in known]:
         return found
     raise DataError(
         f"{source.path}: the policy was trained on the layouts of all its {len(of_tasks)} demonstrations; give a "
@@ -291,12 +293,12 @@ def _unseen(loaded: Loaded, run: Path, source: Source, corpus: Corpus) -> list[i
     )
 
 
-def _known_layouts(trained: Trained, run: Path, source: Source) -> set[tuple[str, int]]:
+def _known_layouts(trained: TrainedPolicy, run: Path, source: TrainingSource) -> set[tuple[str, int]]:
     """Simulated layouts, by task and seed, that a policy was trained on and that another dataset may hold too."""
-    planned = read_run(run) if (run / RUN).exists() else None
+    planned = read_run_config(run) if (run / RUN).exists() else None
     if "expert" in source.settings:
-        layouts = [(task, seed) for task in sorted(trained.layouts) for seed in trained.layouts[task]]
-        return set([layouts[k] for k in planned.train] if layouts and planned is not None else layouts)
+        scene_seeds = [(task, seed) for task in sorted(trained.scene_seeds) for seed in trained.scene_seeds[task]]
+        return set([scene_seeds[k] for k in planned.train] if scene_seeds and planned is not None else scene_seeds)
     if planned is not None and source.path.resolve() == planned.dataset:
         raise DataError(
             f"{source.path}: its content is no longer what {run} was trained on, and nothing tells which of its "
@@ -305,15 +307,15 @@ def _known_layouts(trained: Trained, run: Path, source: Source) -> set[tuple[str
     return set()
 
 
-def _only(corpus: Corpus, demos: Sequence[int]) -> Corpus:
+def _only(buffer: ReplayBuffer, demos: Sequence[int]) -> ReplayBuffer:
     """The corpus with some of its demonstrations."""
     names = ("queries", "query_role", "query_count")
-    mine: dict[str, Any] = {name: getattr(corpus, name)[list(demos)] for name in names}
-    return replace(corpus, demos=tuple(corpus.demos[k] for k in demos), **mine)
+    mine: dict[str, Any] = {name: getattr(buffer, name)[list(demos)] for name in names}
+    return replace(buffer, demos=tuple(buffer.demos[k] for k in demos), **mine)
 
 
-def _cameras(path: Path, corpus: Corpus) -> list[Camera]:
+def _cameras(path: Path, buffer: ReplayBuffer) -> list[Camera]:
     """The camera of every demonstration: a simulated dataset's, or its recording's."""
     shards = {(r.task, r.seed): r.shard for r in Dataset(path).refs}
-    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in corpus.demos}}
-    return [Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in corpus.demos]
+    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.demos}}
+    return [Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in buffer.demos]

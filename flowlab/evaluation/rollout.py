@@ -8,19 +8,19 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from flowlab.data.batches import ObservationBatch
+from flowlab.deployment.runner import PolicyRunner, concatenate
 from flowlab.errors import DataError
-from flowlab.evaluation.actor import Actor, together
-from flowlab.evaluation.flow import flow_error
-from flowlab.evaluation.trials import Outcome, Trial
-from flowlab.learning.batches import Context
-from flowlab.learning.policy import Plan, PolicyNetwork
+from flowlab.evaluation.flow_error import flow_error
+from flowlab.evaluation.trials import EpisodeResult, Trial
+from flowlab.policies.base import ActionPlan, PolicyNetwork
 from flowlab.records import Queries
-from flowlab.sim.environment import ACTION_SIZE, SceneSettings
-from flowlab.sim.rollout import Live, Rollout, Studio
+from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
+from flowlab.sim.simulation import ACTION_SIZE, SceneSettings
 
 MAX_STEPS = 200
 """DP3's and 3D FDP's limit."""
-LANES = 4
+BATCH_SLOTS = 4
 """Windows of every plan. More hardly cost less each (on a CPU, the encoder's products are large enough), and each
 needs a simulation of its own."""
 _LAST_LOOKED_AT = 2
@@ -31,7 +31,7 @@ _LAST_LOOKED_AT = 2
 class Attempt:
     """An episode that a policy has been through."""
 
-    outcome: Outcome
+    outcome: EpisodeResult
     rollout: Rollout
     queries: Queries | None
     """The points whose motion was predicted."""
@@ -40,26 +40,26 @@ class Attempt:
     are executed."""
 
 
-class Stage:
+class SimulatorPool:
     """Simulations of one task, one for each lane, made as they are needed and used again."""
 
     def __init__(self, task: str, scene: SceneSettings) -> None:
         self.task, self.scene = task, scene
-        self._studios: dict[int, Studio] = {}
+        self._simulators: dict[int, TaskSimulator] = {}
 
-    def studio(self, lane: int) -> Studio:
+    def simulator(self, lane: int) -> TaskSimulator:
         """That of a lane."""
-        if lane not in self._studios:
-            self._studios[lane] = Studio(self.task, self.scene)
-        return self._studios[lane]
+        if lane not in self._simulators:
+            self._simulators[lane] = TaskSimulator(self.task, self.scene)
+        return self._simulators[lane]
 
 
 def roll_out(
     policy: PolicyNetwork,
-    stage: Stage,
+    stage: SimulatorPool,
     trials: Sequence[Trial],
     *,
-    executed: int | None = None,
+    n_action_steps: int | None = None,
     max_steps: int = MAX_STEPS,
     look_always: bool = False,
 ) -> Iterator[Attempt]:
@@ -69,9 +69,9 @@ def roll_out(
     every plan has ``LANES`` windows, a trial's is always the same of them (its number modulo ``LANES``), and its noise
     is its own. Only frames that a plan looks at are taken, but with ``look_always``, which changes nothing.
     """
-    lanes = [_Lane(k, policy, stage, executed, max_steps, look_always) for k in range(LANES)]
+    lanes = [_BatchSlot(k, policy, stage, n_action_steps, max_steps, look_always) for k in range(BATCH_SLOTS)]
     for trial in trials:
-        lanes[trial.episode % LANES].waiting.append(trial)
+        lanes[trial.episode % BATCH_SLOTS].waiting.append(trial)
     device = next(policy.parameters()).device
     while ready := [lane for lane in lanes if lane.ready()]:
         yield from (lane.give_up() for lane in ready if lane.is_blind)
@@ -79,7 +79,7 @@ def roll_out(
         if not ready:
             continue
         spare = ready[0].context()
-        whole = together([lane.context() if lane in ready else spare for lane in lanes]).to(device)
+        whole = concatenate([lane.context() if lane in ready else spare for lane in lanes]).to(device)
         plan = policy.plan(whole, [lane.noise for lane in lanes])
         yield from (attempt for lane in ready if (attempt := lane.go_on(plan)) is not None)
 
@@ -89,27 +89,27 @@ class _UnderWay:
     """An episode that has begun."""
 
     trial: Trial
-    live: Live
-    actor: Actor
+    live: EpisodeRecorder
+    actor: PolicyRunner
     success_dp3: bool = False
     note: str = ""
     predicted: list[tuple[int, Float32[np.ndarray, "K M 3"]]] = field(default_factory=list)
 
 
-class _Lane:
+class _BatchSlot:
     """One window of every plan: tries its episodes one after the other."""
 
     def __init__(
         self,
         index: int,
         policy: PolicyNetwork,
-        stage: Stage,
-        executed: int | None,
+        stage: SimulatorPool,
+        n_action_steps: int | None,
         max_steps: int,
         look_always: bool,
     ) -> None:
         self._index, self._policy, self._stage = index, policy, stage
-        self._executed, self._max_steps, self._look_always = executed, max_steps, look_always
+        self._n_action_steps, self._max_steps, self._look_always = n_action_steps, max_steps, look_always
         self.waiting: deque[Trial] = deque()
         self.under_way: _UnderWay | None = None
         self.noise = torch.Generator()
@@ -118,9 +118,9 @@ class _Lane:
         """Begin the next episode if none is under way; whether one is."""
         if self.under_way is None and self.waiting:
             trial = self.waiting.popleft()
-            actor = Actor(self._policy.spec, trial.task, trial.layout, self._executed)
+            actor = PolicyRunner(self._policy.spec, trial.task, trial.scene_seed, self._n_action_steps)
             self.noise = actor.noise
-            self.under_way = _UnderWay(trial, self._stage.studio(self._index).begin(trial.layout), actor)
+            self.under_way = _UnderWay(trial, self._stage.simulator(self._index).begin(trial.scene_seed), actor)
             self._look()
         return self.under_way is not None
 
@@ -137,19 +137,19 @@ class _Lane:
         self.under_way = None
         return _finished(episode)
 
-    def context(self) -> Context:
+    def context(self) -> ObservationBatch:
         """What a plan for the episode under way is decided on."""
         assert self.under_way is not None
         return self.under_way.actor.context()
 
-    def go_on(self, plan: Plan) -> Attempt | None:
+    def go_on(self, plan: ActionPlan) -> Attempt | None:
         """Execute this lane's part of a plan; the attempt if it has come to its end."""
         episode = self.under_way
         assert episode is not None
         live, actor = episode.live, episode.actor
         began = len(live.success)
         if plan.flow is not None:
-            now = actor.spec.settings.history - 1
+            now = actor.spec.settings.n_obs_steps - 1
             flow = plan.flow[self._index, now:].cpu().numpy()
             episode.predicted.append((began, flow))
         actor.follow(plan, self._index)
@@ -170,10 +170,10 @@ class _Lane:
     def _look(self) -> None:
         assert self.under_way is not None
         episode, live = self.under_way, self.under_way.live
-        if not (episode.actor.looks or self._look_always):
+        if not (episode.actor.needs_frame or self._look_always):
             return
         frame = live.frame()
-        if episode.actor.looks:
+        if episode.actor.needs_frame:
             try:
                 episode.actor.see(frame, live.simulation.state)
             except DataError as error:
@@ -192,15 +192,15 @@ def _finished(episode: _UnderWay) -> Attempt:
     trial, live, queries = episode.trial, episode.live, episode.actor.queries
     rollout, predicted = live.rollout(), tuple(episode.predicted)
     solved = bool(any(live.success)) and not episode.note
-    outcome = Outcome(
+    outcome = EpisodeResult(
         task=trial.task,
         seed=trial.seed,
         episode=trial.episode,
-        layout=trial.layout,
+        scene_seed=trial.scene_seed,
         success=solved,
         success_dp3=solved and episode.success_dp3,
         steps=live.success.index(True) + 1 if solved else len(live.success),
         note=episode.note,
-        flow=None if queries is None else flow_error(rollout, queries, predicted, episode.actor.executed),
+        flow=None if queries is None else flow_error(rollout, queries, predicted, episode.actor.n_action_steps),
     )
     return Attempt(outcome, rollout, queries, predicted)

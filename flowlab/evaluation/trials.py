@@ -8,10 +8,10 @@ from typing import Any
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError
-from flowlab.storage.files import write_whole
+from flowlab.files import write_atomically
 
-LAYOUTS_OF_A_SEED = 1_000_000
-"""Seed s is evaluated on the layouts from ``(s + 1) * LAYOUTS_OF_A_SEED`` on; demonstrations are numbered from 0."""
+SCENES_PER_SEED = 1_000_000
+"""Seed s is evaluated on the layouts from ``(s + 1) * SCENES_PER_SEED`` on; demonstrations are numbered from 0."""
 MOST_SEEDS = 4000
 """Beyond, layouts would have no numbers left: MetaWorld's generator takes 32 bits."""
 
@@ -25,12 +25,12 @@ class Trial:
     episode: int
 
     @property
-    def layout(self) -> int:
+    def scene_seed(self) -> int:
         """Seed of the scene's layout, and of the policy's noise."""
-        return (self.seed + 1) * LAYOUTS_OF_A_SEED + self.episode
+        return (self.seed + 1) * SCENES_PER_SEED + self.episode
 
 
-class FlowError(Settings):
+class RolloutFlowError(Settings):
     """Predicted flow against where the query points really went while the actions were executed.
 
     Of an episode, over its plans; a point is where it truly was when the plan was made. ``zero`` predicts that nothing
@@ -59,13 +59,13 @@ class FlowError(Settings):
     """Mean distance over these."""
 
 
-class Outcome(Settings):
+class EpisodeResult(Settings):
     """How one trial went: a line of ``episodes.jsonl``."""
 
     task: str
     seed: int
     episode: int
-    layout: int
+    scene_seed: int
     success: bool
     """Whether the task counted as solved after any step."""
     success_dp3: bool
@@ -74,7 +74,7 @@ class Outcome(Settings):
     """Until it first did, or all."""
     note: str = ""
     """Why the episode ended early, if something broke down; it counts as failed."""
-    flow: FlowError | None = None
+    flow: RolloutFlowError | None = None
     """None for policies that predict none, and where nothing moved."""
 
     @property
@@ -87,47 +87,47 @@ def trials(tasks: Sequence[str], seeds: Sequence[int], episodes: int) -> list[Tr
     """Every episode of an evaluation, task by task."""
     if bad := [s for s in seeds if not 0 <= s < MOST_SEEDS]:
         raise UsageError(f"seed {bad[0]}: evaluation seeds are from 0 to {MOST_SEEDS - 1}")
-    if not 0 < episodes <= LAYOUTS_OF_A_SEED:
-        raise UsageError(f"{episodes} episodes: a seed has from 1 to {LAYOUTS_OF_A_SEED:,}")
+    if not 0 < episodes <= SCENES_PER_SEED:
+        raise UsageError(f"{episodes} episodes: a seed has from 1 to {SCENES_PER_SEED:,}")
     return [Trial(task, seed, k) for task in tasks for seed in dict.fromkeys(seeds) for k in range(episodes)]
 
 
 def check_unseen(wanted: Iterable[Trial], trained_on: Mapping[str, Sequence[int]], where: Path) -> None:
     """Refuse to evaluate on a layout that the policy's dataset holds."""
     for trial in wanted:
-        if trial.layout in trained_on.get(trial.task, ()):
+        if trial.scene_seed in trained_on.get(trial.task, ()):
             raise UsageError(
-                f"{where}: its dataset holds the layout {trial.layout} of {trial.task}, which evaluation seed "
-                f"{trial.seed} would try; demonstrations belong below {LAYOUTS_OF_A_SEED:,}: make them with another "
+                f"{where}: its dataset holds the layout {trial.scene_seed} of {trial.task}, which evaluation seed "
+                f"{trial.seed} would try; demonstrations belong below {SCENES_PER_SEED:,}: make them with another "
                 "first_seed, or evaluate other --seeds"
             )
 
 
-def append(path: Path, outcome: Outcome) -> None:
+def append(path: Path, outcome: EpisodeResult) -> None:
     """Add an outcome to a file, in one write, so that processes may share it."""
     line = outcome.model_dump_json(exclude_defaults=True) + "\n"
     with path.open("ab", buffering=0) as file:
         file.write(line.encode())
 
 
-def read(path: Path) -> dict[Trial, Outcome]:
+def read(path: Path) -> dict[Trial, EpisodeResult]:
     """The outcomes in a file. A last line that a kill cut off is left out; later lines count."""
     return {outcome.trial: outcome for outcome in _lines(path)}
 
 
-def mend(path: Path) -> None:
+def repair_tail(path: Path) -> None:
     """Take off a last line that a kill cut off, so that others can be added."""
     text = path.read_bytes() if path.exists() else b""
     if text and not text.endswith(b"\n"):
-        write_whole(path, text[: text.rfind(b"\n") + 1].decode())
+        write_atomically(path, text[: text.rfind(b"\n") + 1].decode())
 
 
-def _lines(path: Path) -> Iterator[Outcome]:
+def _lines(path: Path) -> Iterator[EpisodeResult]:
     *whole, _ = (path.read_bytes() if path.exists() else b"").split(b"\n")
     for number, line in enumerate(whole, 1):
         try:
             values: Any = json.loads(line)
-            yield Outcome.model_validate(values)
+            yield EpisodeResult.model_validate(values)
         except ValueError as error:  # pydantic's too
             raise DataError(
                 f"{path}: line {number} is damaged (expected how an episode went, found "

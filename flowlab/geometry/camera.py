@@ -11,7 +11,7 @@ from jaxtyping import Float, Num
 class Camera:
     """A calibrated pinhole camera without distortion.
 
-    Axes: x right, y down, z forward. The centre of pixel (u, v) lies at integer coordinates (u, v), so
+    Axes: x right, y down, z forward. The center of pixel (u, v) lies at integer coordinates (u, v), so
     an image of width W whose optical axis passes through its middle has ``cx = (W - 1) / 2``.
     """
 
@@ -26,7 +26,7 @@ class Camera:
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float, T_world_cam: np.ndarray) -> "Camera":
-        """A centred camera with square pixels and the vertical field of view ``fovy_deg``."""
+        """A centerd camera with square pixels and the vertical field of view ``fovy_deg``."""
         f = 0.5 * height / np.tan(np.deg2rad(fovy_deg) / 2)
         K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
         return cls(width, height, K, T_world_cam)

@@ -1,4 +1,4 @@
-"""The Observer: unproject, crop, sample. There is one, for labelling, training data and evaluation."""
+"""The Observer: unproject, crop, sample. There is one, for labeling, training data and evaluation."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
-from flowlab.perception.tidy import SWITCH, OutlierSettings, TableSettings, above_table, not_stray
+from flowlab.perception.cleaning import SWITCH, OutlierSettings, TableSettings, above_table, not_stray
 from flowlab.records import Cloud, Entity, Frame, Observation, Role
 
 Vector3 = tuple[float, float, float]

@@ -12,8 +12,8 @@ from scipy.ndimage import binary_dilation
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
+from flowlab.perception.cleaning import SWITCH
 from flowlab.perception.observer import pad
-from flowlab.perception.tidy import SWITCH
 from flowlab.records import Cloud, Queries, Role
 
 
@@ -24,7 +24,7 @@ class EdgeSettings(Settings):
     """
 
     jump: float = Field(default=0.02, gt=0)
-    """Neighbouring readings that differ by more than this share of the nearer one have an edge between them."""
+    """Neighboring readings that differ by more than this share of the nearer one have an edge between them."""
     margin_px: int = Field(default=2, ge=0)
     """Points up to this many rows and columns from an edge or a hole are not chosen."""
 

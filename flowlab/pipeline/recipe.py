@@ -10,20 +10,20 @@ import yaml
 from pydantic import Field, SerializeAsAny, ValidationError, field_validator
 
 from flowlab.config import Settings, explain, read_named, set_value
-from flowlab.errors import UsageError, unknown
+from flowlab.errors import UsageError, unknown_name
 from flowlab.pipeline.stage import Pipeline, Stage
 
 _STAGES = {
-    "expert": "flowlab.pipeline.stages:ExpertStage",
-    "recording": "flowlab.pipeline.real_stages:RecordingStage",
-    "observer": "flowlab.pipeline.shared_stages:ObserverStage",
-    "queries": "flowlab.pipeline.shared_stages:QueriesStage",
-    "rigid-flow": "flowlab.pipeline.stages:RigidFlowStage",
-    "track": "flowlab.pipeline.real_stages:TrackStage",
-    "lift": "flowlab.pipeline.real_stages:LiftStage",
-    "quality": "flowlab.pipeline.real_stages:QualityStage",
-    "accept": "flowlab.pipeline.shared_stages:AcceptStage",
-    "write": "flowlab.pipeline.shared_stages:WriteStage",
+    "expert": "flowlab.pipeline.stages.simulation:ExpertStage",
+    "recording": "flowlab.pipeline.stages.recording:RecordingStage",
+    "observer": "flowlab.pipeline.stages.shared:ObserverStage",
+    "queries": "flowlab.pipeline.stages.shared:QueriesStage",
+    "rigid-flow": "flowlab.pipeline.stages.simulation:RigidFlowStage",
+    "track": "flowlab.pipeline.stages.recording:TrackStage",
+    "lift": "flowlab.pipeline.stages.recording:LiftStage",
+    "quality": "flowlab.pipeline.stages.recording:QualityStage",
+    "accept": "flowlab.pipeline.stages.shared:AcceptStage",
+    "write": "flowlab.pipeline.stages.shared:WriteStage",
 }
 """Imported only when a recipe names them: simulation needs no trackers, and recordings no simulator."""
 
@@ -93,7 +93,7 @@ def _make_stage(values: Any) -> Stage:
         raise UsageError(f"every stage needs a name, as in 'stage: observer'; found {values!r}")
     name = values["stage"]
     if ":" not in name and name not in _STAGES:
-        raise unknown("stage", name, _STAGES)
+        raise unknown_name("stage", name, _STAGES)
     cls = _own_stage(name) if ":" in name else _load(_STAGES[name])
     try:
         return cls.model_validate(dict(values))
@@ -128,7 +128,7 @@ def _override(values: dict[str, Any], text: str) -> None:
         raise UsageError(f"--set {text}: must look like observer.points=512")
     known = [*stages, *(k for k in Recipe.model_fields if k != "stages")]
     if first not in known:
-        raise unknown("stage or key of this recipe", first, known)
+        raise unknown_name("stage or key of this recipe", first, known)
     if first in stages and not rest:
         raise UsageError(f"--set {text}: '{first}' is a stage; name one of its settings")
     target, path = (stages[first], rest) if first in stages else (values, [first, *rest])

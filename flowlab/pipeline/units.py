@@ -29,14 +29,14 @@ class WorkUnit(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class JobShard:
     """Part ``index`` of ``count`` of the units, for jobs that fill one dataset together."""
 
     index: int = 0
     count: int = 1
 
     @classmethod
-    def parse(cls, text: str) -> "Share":
+    def parse(cls, text: str) -> "JobShard":
         """From ``i/n`` with i counted from 0."""
         index, slash, count = text.partition("/")
         if not (slash and index.isdigit() and count.isdigit() and int(index) < int(count)):

@@ -44,7 +44,7 @@ def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUni
         digests=tuple(episode_digest(e) for e in episodes),
         rejects=tuple(rejects),
         stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
-        stats=stats.summarise(episodes) if episodes else {},
+        stats=stats.summarize(episodes) if episodes else {},
         peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     )
     keep_receipt(folder, receipt)

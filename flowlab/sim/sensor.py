@@ -21,7 +21,7 @@ class SensorSettings(Settings):
     axial_noise: float = Field(default=0.0015, ge=0)
     """Depth noise [1/m]: its standard deviation is this times z²."""
     axial_correlation_px: float = Field(default=1.0, ge=0)
-    """How far neighbouring pixels err alike: standard deviation of the Gaussian that smooths the noise."""
+    """How far neighboring pixels err alike: standard deviation of the Gaussian that smooths the noise."""
     inverse_depth_step: float = Field(default=1 / 348, ge=0)
     """1/z comes in multiples of this [1/m], so depth in steps of about this times z²: a sixteenth of a pixel
     of disparity at a focal length of 290 px and a baseline of 75 mm."""
@@ -36,11 +36,11 @@ class SensorSettings(Settings):
     max_range_m: float = Field(default=6.0, gt=0, lt=_EMPTY_M)
     """Nothing farther is seen."""
     gain_noise: float = Field(default=0.015, ge=0)
-    """Flicker: standard deviation of the brightness of a whole colour picture, as a share."""
-    colour_noise: float = Field(default=3.0, ge=0)
-    """Standard deviation of every colour value, of 255."""
+    """Flicker: standard deviation of the brightness of a whole color picture, as a share."""
+    color_noise: float = Field(default=3.0, ge=0)
+    """Standard deviation of every color value, of 255."""
     jpeg_quality: int = Field(default=92, ge=0, le=100)
-    """Colour pictures are compressed and unpacked at this quality; 0 leaves them alone."""
+    """Color pictures are compressed and unpacked at this quality; 0 leaves them alone."""
 
 
 KINECT = SensorSettings()
@@ -52,7 +52,7 @@ CLEAN = SensorSettings(
     random_holes=0,
     blotch_sigmas=0,
     gain_noise=0,
-    colour_noise=0,
+    color_noise=0,
     jpeg_quality=0,
 )
 """Sees perfectly, but not beyond its range."""
@@ -87,14 +87,14 @@ class Sensor:
         return np.where(unseen, 0, read).astype(np.float32)
 
     def rgb(self, picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-        """What it makes of a colour picture."""
+        """What it makes of a color picture."""
         s = self.settings
         gain = 1 + s.gain_noise * self._rng.standard_normal()
-        noise = s.colour_noise * self._rng.standard_normal(picture.shape, np.float32)
+        noise = s.color_noise * self._rng.standard_normal(picture.shape, np.float32)
         noisy = np.clip(np.rint(picture * np.float32(gain) + noise), 0, 255).astype(np.uint8)
         if not s.jpeg_quality:
             return noisy
-        # JPEG blurs colour more than brightness, so it matters that OpenCV is told the channels in its order.
+        # JPEG blurs color more than brightness, so it matters that OpenCV is told the channels in its order.
         _, packed = cv2.imencode(".jpg", noisy[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, s.jpeg_quality])
         unpacked = cv2.imdecode(packed, cv2.IMREAD_COLOR)
         assert unpacked is not None

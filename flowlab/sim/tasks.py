@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from flowlab.errors import unknown
+from flowlab.errors import unknown_name
 
 _BY_DIFFICULTY = {
     "easy": """button-press button-press-topdown button-press-topdown-wall button-press-wall coffee-button
@@ -61,7 +61,7 @@ def find_task(name: str) -> Task:
     """The task of that name; MetaWorld's ``-v3`` ending may be left on."""
     task = TASKS.get(name.removesuffix("-v3"))
     if task is None:
-        raise unknown("task", name, TASKS)
+        raise unknown_name("task", name, TASKS)
     return task
 
 
@@ -70,6 +70,6 @@ def select_tasks(names: Iterable[str], groups: Iterable[str]) -> tuple[str, ...]
     chosen = [find_task(name).name for name in names]
     for group in groups:
         if group not in GROUPS:
-            raise unknown("group of tasks", group, GROUPS)
+            raise unknown_name("group of tasks", group, GROUPS)
         chosen += GROUPS[group]
     return tuple(dict.fromkeys(chosen))

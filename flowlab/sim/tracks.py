@@ -11,12 +11,12 @@ from flowlab.config import Settings
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import apply, inverse
 from flowlab.records import Queries, Tracks3D
-from flowlab.sim.rollout import Rollout
+from flowlab.sim.recorder import Rollout
 from flowlab.sim.scene import Poses, Scene
 
 DEPTH_TOLERANCE_PX = 2.0
 """How far behind the depth picture a point may lie and still be the surface it shows, in pixel widths at
-its distance (z / f): a pixel's depth is that of its centre, and a slanted surface recedes within it. Of
+its distance (z / f): a pixel's depth is that of its center, and a slanted surface recedes within it. Of
 the tolerances tried against ``mj_ray``, 2 agrees best (94 % of points and frames, 128x128, 8 tasks)."""
 
 

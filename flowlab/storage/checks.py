@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowlab.records import Episode, Source
+from flowlab.records import Episode, PositionSource
 from flowlab.storage.schema import SCHEMA
 
 TELEPORT = 0.15
@@ -65,7 +65,7 @@ def _estimated_teleports(e: Episode, step: np.ndarray) -> Iterator[Problem]:
     """Only points that were followed through a step can jump in it; one that comes back from hiding may be anywhere."""
     quality = e.tracks.quality
     assert quality is not None
-    known = e.tracks.visible & (quality.source != Source.FILLED)
+    known = e.tracks.visible & (quality.source != PositionSource.FILLED)
     known = known[1:] & known[:-1]
     possible = np.maximum(TELEPORT, FASTEST * np.diff(e.time_s))[:, None]
     far = known & (step > possible + 3 * (quality.sigma[1:] + quality.sigma[:-1]))
@@ -83,10 +83,13 @@ def _quality(e: Episode) -> Iterator[Problem]:
     quality = e.tracks.quality
     if quality is None:
         return
-    measured = quality.source == Source.MEASURED
+    measured = quality.source == PositionSource.MEASURED
     wrong = {
         "sigma": (quality.sigma <= 0, "states an error that is not above 0"),
-        "source": ((quality.source < Source.MEASURED) | (quality.source > Source.FILLED), "has a source that is none"),
+        "source": (
+            (quality.source < PositionSource.MEASURED) | (quality.source > PositionSource.FILLED),
+            "has a source that is none",
+        ),
         "visible": (measured & ~e.tracks.visible, "is measured, yet not visible"),
         "depth_valid": (
             measured & e.tracks.visible & ~quality.depth_valid,
@@ -128,7 +131,7 @@ def _off_surface(e: Episode) -> Iterator[Problem]:
     """
     far = total = 0
     quality = e.tracks.quality
-    known = e.tracks.visible if quality is None else e.tracks.visible & (quality.source != Source.FILLED)
+    known = e.tracks.visible if quality is None else e.tracks.visible & (quality.source != PositionSource.FILLED)
     slack = np.zeros(known.shape, np.float32) if quality is None else 2 * quality.sigma
     for t in range(0, len(e), 4):
         cloud = e.point_cloud[t, : e.point_count[t]]

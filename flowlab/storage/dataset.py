@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.errors import DataError
+from flowlab.files import locked, remove_leftovers, write_atomically, write_json
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
-from flowlab.storage.files import locked, remove_leftovers, write_json, write_whole
 from flowlab.storage.manifest import MANIFEST, Manifest, Receipt, differences, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.shard import Shard
@@ -197,11 +197,11 @@ def keep_receipt(folder: Path, receipt: Receipt) -> None:
     write_json(folder / "receipts" / f"{receipt.unit}.json", json.loads(receipt.model_dump_json()))
 
 
-def summarise(folder: Path) -> Dataset:
+def summarize(folder: Path) -> Dataset:
     """Write what follows from the receipts: statistics, rejects and the dataset card."""
     dataset = Dataset(folder)
     write_json(folder / "stats.json", dataset.stats)
     rejects = [x.model_dump_json(exclude_defaults=True) + "\n" for r in dataset.receipts for x in r.rejects]
-    write_whole(folder / "rejects.jsonl", "".join(rejects))
-    write_whole(folder / "README.md", dataset_card(dataset.manifest, dataset.receipts, dataset.stats))
+    write_atomically(folder / "rejects.jsonl", "".join(rejects))
+    write_atomically(folder / "README.md", dataset_card(dataset.manifest, dataset.receipts, dataset.stats))
     return dataset

@@ -8,18 +8,18 @@ from typing import Any
 
 from pydantic import ValidationError, model_validator
 
-from flowlab import __version__
 from flowlab.config import Settings
 from flowlab.errors import DataError
-from flowlab.storage.files import read_json
+from flowlab.files import read_json
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
+from flowlab.version import __version__
 
 MANIFEST = "flowlab.json"
 UNITS = {
     "length": "m",
     "time": "s",
-    "camera": "OpenCV axes (x right, y down, z forward); pixel centres at integer coordinates",
+    "camera": "OpenCV axes (x right, y down, z forward); pixel centers at integer coordinates",
     "rotation": "6D: first two columns of the rotation matrix",
 }
 

@@ -84,7 +84,7 @@ SCHEMA = (
         "data/depth", "float32", ("time", "v", "u"), "m", "z-depth picture; 0 where there is no reading",
         lambda e: e.depth, optional=True,
     ),
-    ArraySpec("data/rgb", "uint8", ("time", "v", "u", "rgb"), "1", "colour picture", lambda e: e.rgb, optional=True),
+    ArraySpec("data/rgb", "uint8", ("time", "v", "u", "rgb"), "1", "color picture", lambda e: e.rgb, optional=True),
     _quality("sigma", "float32", "m", "stated error of the position: 68 % of errors are meant to be below it"),
     _quality(
         "source", "uint8", "1", "where the position comes from: 1 measured, 2 carried by a fitted motion, 3 filled in"
@@ -100,7 +100,7 @@ SCHEMA = (
     ),
     _quality(
         "residual", "float32", "1",
-        "how badly the fitted motion explains colour and depth around the point, 0 to 1; -1 where there is none",
+        "how badly the fitted motion explains color and depth around the point, 0 to 1; -1 where there is none",
     ),
     ArraySpec("meta/seed", "int64", ("episode",), "1", "seed of the episode", lambda e: _row(e.seed, "int64")),
     ArraySpec(

@@ -17,9 +17,9 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from flowlab.errors import DataError
+from flowlab.files import temporary_path
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
-from flowlab.storage.files import temporary_path
 from flowlab.storage.schema import EPISODE_ENDS, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
 
 STEPS_PER_CHUNK = 256

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from flowlab.records import Episode, Quality, Source
+from flowlab.records import Episode, PositionSource, Quality
 
 STILL = 1e-4
 """A query point that moves less than this in one step [m] counts as still."""
@@ -26,7 +26,7 @@ histogram of step lengths, ``quality`` (of estimated tracks only) that of stated
 come from where; further numbers are sums."""
 
 
-def summarise(episodes: Iterable[Episode]) -> Summary:
+def summarize(episodes: Iterable[Episode]) -> Summary:
     """The mergeable statistics of some episodes."""
     return merge(_of_episode(e) for e in episodes)
 
@@ -75,14 +75,14 @@ def describe(summary: Summary) -> dict[str, Any]:
 
 def _of_episode(e: Episode) -> Summary:
     step = np.linalg.norm(e.flow[:-1], axis=-1)
-    travelled = np.linalg.norm(e.tracks.xyz_world - e.tracks.xyz_world[0], axis=-1).max(0)
+    traveled = np.linalg.norm(e.tracks.xyz_world - e.tracks.xyz_world[0], axis=-1).max(0)
     arrays = {name: take(e) for name, take in _CHANNELS.items()}
     quality = {} if e.tracks.quality is None else {"quality": _of_quality(e.tracks.quality, e.tracks.visible)}
     return quality | {
         "episodes": 1,
         "frames": len(e),
-        "points": travelled.size,
-        "moving_points": int((travelled > 0.01).sum()),
+        "points": traveled.size,
+        "moving_points": int((traveled > 0.01).sum()),
         "steps": np.histogram(step, _BINS)[0].tolist(),
         "arrays": {name: _moments(a) for name, a in arrays.items() if a is not None and a.size},
     }
@@ -93,7 +93,7 @@ def _of_quality(quality: Quality, visible: np.ndarray) -> dict[str, list[int]]:
     return {
         "sigma": np.histogram(quality.sigma, _BINS)[0].tolist(),
         "sigma_visible": np.histogram(quality.sigma[visible], _BINS)[0].tolist(),
-        "source": [int((quality.source == s).sum()) for s in Source],
+        "source": [int((quality.source == s).sum()) for s in PositionSource],
     }
 
 
@@ -109,7 +109,9 @@ def _describe_quality(sums: Mapping[str, list[int]]) -> dict[str, Any]:
         "sigma_m": {f"p{q}": _quantile(sigma, q / 100) for q in (50, 90, 95)},
         "visible_sigma_m": {f"p{q}": _quantile(visible, q / 100) for q in (50, 90, 95)},
         "visible_share": int(visible.sum()) / total,
-        "source_share": {s.name.lower(): int(source[s]) / total for s in Source if s is not Source.SIMULATOR},
+        "source_share": {
+            s.name.lower(): int(source[s]) / total for s in PositionSource if s is not PositionSource.SIMULATOR
+        },
     }
 
 

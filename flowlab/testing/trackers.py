@@ -18,7 +18,7 @@ import numpy as np
 
 from flowlab.geometry.camera import Camera
 from flowlab.records import Clip, Tracks2D
-from flowlab.tracking.tracker import Tracker
+from flowlab.tracking.base import Tracker
 
 WIDTH, HEIGHT, FRAMES = 192, 128, 10
 AXIS = np.array([60.0, -150.0])
@@ -26,7 +26,7 @@ AXIS = np.array([60.0, -150.0])
 ROLL = np.array([0.004, 0.0006])
 """Speed [rad per frame] and half the acceleration: a part of the clip cannot be taken for another."""
 BIAS_PX = 0.25
-"""Half of what a wrong convention of pixel centres makes."""
+"""Half of what a wrong convention of pixel centers makes."""
 MEDIAN_PX = 1.0
 SAME_PX = 0.01
 
@@ -58,7 +58,7 @@ def _turn(xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 @cache
 def rolling() -> Rolling:
-    """The clip of all checks. Every pixel is computed at its centre from plane waves, nothing is interpolated."""
+    """The clip of all checks. Every pixel is computed at its center from plane waves, nothing is interpolated."""
     rng = np.random.default_rng(0)
     angle, length = rng.uniform(0, np.pi, 24), rng.uniform(7, 40, 24)
     wave = 2 * np.pi / length * np.stack([np.cos(angle), np.sin(angle)])
@@ -82,9 +82,9 @@ def check_tracker(make: MakeTracker) -> None:
 
 
 def check_description(make: MakeTracker) -> None:
-    """It has a name and a licence, and describes itself in JSON."""
+    """It has a name and a license, and describes itself in JSON."""
     tracker = make()
-    for field in ("name", "licence"):
+    for field in ("name", "license"):
         value = getattr(tracker, field, None)
         _require(isinstance(value, str) and value, f"{field} must be some words, but is {value!r}")
     try:
@@ -112,7 +112,7 @@ def check_query_frame(make: MakeTracker) -> None:
     _require(
         off[t == own].max() < SAME_PX,
         f"at the frame of its query a point must be where the query says, but is up to {off[t == own].max():.2f} px "
-        "away; queries are (t, x, y), tracks (x, y), pixel centres integers",
+        "away; queries are (t, x, y), tracks (x, y), pixel centers integers",
     )
     _require(tracks.visible[t == own].all(), "a point must be visible at the frame of its query")
     _require(off[t < own].max() < SAME_PX, "before the frame of its query a point must be held where the query says")
@@ -170,7 +170,7 @@ CHECKS: tuple[Callable[[MakeTracker], None], ...] = (
     check_no_queries,
     check_border,
 )
-"""Every promise of :class:`~flowlab.tracking.tracker.Session`, one at a time."""
+"""Every promise of :class:`~flowlab.tracking.base.Session`, one at a time."""
 
 
 def _queries(*frames: int) -> np.ndarray:
@@ -211,7 +211,7 @@ def _check_motion(tracks: Tracks2D, queries: np.ndarray, start: int) -> None:
     bias = np.median(error, axis=0)
     _require(
         np.abs(bias).max() < BIAS_PX,
-        f"points are shifted by ({bias[0]:+.2f}, {bias[1]:+.2f}) px; the centre of the first pixel is (0, 0)",
+        f"points are shifted by ({bias[0]:+.2f}, {bias[1]:+.2f}) px; the center of the first pixel is (0, 0)",
     )
     seen = float(tracks.visible[after].mean())
     _require(seen > 0.8, f"all points are in sight, but only {seen:.0%} of them are visible")

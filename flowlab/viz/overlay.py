@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from flowlab.records import Episode, Foreseen, Source
-from flowlab.viz.colours import PREDICTED_RGB, track_rgb
-from flowlab.viz.forecasts import Forecast, forecasts
+from flowlab.records import Episode, FlowPrediction, PositionSource
+from flowlab.viz.colors import PREDICTED_RGB, track_rgb
+from flowlab.viz.plan_predictions import PlanPrediction, plan_predictions
 from flowlab.viz.upright import upright_pixels
 
 _RIM = (16, 18, 22)
@@ -28,16 +28,18 @@ class Overlay:
     goes back.
     """
 
-    def __init__(self, episode: Episode, scale: int, trail: int, foreseen: Foreseen | None = None) -> None:
+    def __init__(self, episode: Episode, scale: int, trail: int, prediction: FlowPrediction | None = None) -> None:
         M, quality = episode.queries.count, episode.tracks.quality
         self._episode, self._scale = episode, scale
         self._uv, self._there = self._on_canvas(episode.tracks.xyz_world[:, :M])
         self._visible = episode.tracks.visible[:, :M]
-        self._filled = np.zeros_like(self._visible) if quality is None else quality.source[:, :M] == Source.FILLED
+        self._filled = (
+            np.zeros_like(self._visible) if quality is None else quality.source[:, :M] == PositionSource.FILLED
+        )
         self._rgb = track_rgb(episode)
         self._trail = trail
         self._size = max(1.0, episode.camera.width * scale / 640)
-        self._plans = [] if foreseen is None else forecasts(episode, foreseen)
+        self._plans = [] if prediction is None else plan_predictions(episode, prediction)
 
     def draw(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
         """Draw trails, expected paths and points of step t onto the canvas."""
@@ -58,16 +60,16 @@ class Overlay:
     ) -> tuple[Int[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
         """Where points are on the canvas, in OpenCV's fixed point, and whether they are anywhere near it."""
         camera, scale = self._episode.camera, self._scale
-        canvas_uv = (upright_pixels(camera, xyz_world) + 0.5) * scale - 0.5  # the centre of a pixel, enlarged
+        canvas_uv = (upright_pixels(camera, xyz_world) + 0.5) * scale - 0.5  # the center of a pixel, enlarged
         far = 8 * max(camera.width, camera.height) * scale  # OpenCV counts in 32 bits
         there = np.all(np.abs(canvas_uv) < far, axis=-1)
         return np.round(np.where(there[..., None], canvas_uv, 0) * 2**_SUBPIXEL).astype(np.int32), there
 
-    def _draw_forecast(self, canvas: UInt8[np.ndarray, "H W 3"], plan: Forecast) -> None:
+    def _draw_forecast(self, canvas: UInt8[np.ndarray, "H W 3"], plan: PlanPrediction) -> None:
         """Thin bright lines, each with a dot at its end, as far as they can be seen from the camera."""
         import cv2
 
-        uv, there = self._on_canvas(plan.expected_world[:, plan.stirs])
+        uv, there = self._on_canvas(plan.expected_world[:, plan.predicted_moving])
         paths, ends = [path[ok] for path, ok in zip(uv.swapaxes(0, 1), there.T, strict=True)], uv[-1][there[-1]]
         for width, radius, rgb, alpha in ((2.6, 3.2, _RIM, _PATH_RIM_ALPHA), (1.0, 2.4, PREDICTED_RGB, 1.0)):
             layer = canvas.copy()
@@ -85,14 +87,14 @@ class Overlay:
         pieces = np.stack([self._uv[first:t], self._uv[first + 1 : t + 1]], 2)
         there = self._there[first:t] & self._there[first + 1 : t + 1]
         red, green, blue = np.moveaxis(self._rgb[first + 1 : t + 1].astype(int), -1, 0)
-        colour = np.where(there, red << 16 | green << 8 | blue, -1)
+        color = np.where(there, red << 16 | green << 8 | blue, -1)
         quarter = len(_TRAIL_ALPHA) * np.arange(t - first - 1, -1, -1) // self._trail
         quarter = np.where(self._visible[first + 1 : t + 1], quarter[:, None], len(_TRAIL_ALPHA) - 1)
         for age, alpha in reversed(list(enumerate(_TRAIL_ALPHA))):
             layer = canvas.copy()
-            mine, of_colour = pieces[quarter == age], colour[quarter == age]
-            for c in np.unique(of_colour[of_colour >= 0]).tolist():
-                lines, rgb = list(mine[of_colour == c]), (c >> 16, c >> 8 & 255, c & 255)
+            mine, of_color = pieces[quarter == age], color[quarter == age]
+            for c in np.unique(of_color[of_color >= 0]).tolist():
+                lines, rgb = list(mine[of_color == c]), (c >> 16, c >> 8 & 255, c & 255)
                 cv2.polylines(layer, lines, False, rgb, self._px(1.6), cv2.LINE_AA, _SUBPIXEL)
             cv2.addWeighted(layer, alpha, canvas, 1 - alpha, 0, dst=canvas)
 

@@ -16,15 +16,15 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import ColorType
 
+from flowlab.files import temporary_path
 from flowlab.geometry.camera import Camera
 from flowlab.records import Episode
-from flowlab.storage.files import temporary_path
-from flowlab.viz.colours import role_rgb
-from flowlab.viz.facts import role_name
+from flowlab.viz.captions import role_name
+from flowlab.viz.colors import role_rgb
 from flowlab.viz.upright import in_camera_frame, up_from_world
 
-TIME_COLOURS = LinearSegmentedColormap.from_list("time", ["#3b1f8f", "#a3218e", "#e2486a", "#f58a3c", "#f7bf3a"])
-"""From the first step to the last: distinct from grey and readable on white."""
+TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#3b1f8f", "#a3218e", "#e2486a", "#f58a3c", "#f7bf3a"])
+"""From the first step to the last: distinct from gray and readable on white."""
 LEFT = 0.025
 INK, QUIET = "#22262c", "#747b85"
 _SIZE_IN = (12.0, 6.4)
@@ -53,7 +53,7 @@ def save(figure: Figure, path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def head(axes: Axes, text: str) -> None:
+def set_title(axes: Axes, text: str) -> None:
     """Say above a panel what it shows."""
     axes.set_title(text, loc="left", fontsize=10.5, color=INK, pad=10)
 
@@ -136,15 +136,15 @@ def draw_cloud(
 
 
 def trail(track: Float[np.ndarray, "T 2"], width: float = 1.2) -> LineCollection:
-    """One track, coloured by time; ``width`` is in points."""
-    colours = TIME_COLOURS(np.linspace(0, 1, max(len(track) - 1, 1)))
+    """One track, colored by time; ``width`` is in points."""
+    colors = TIME_COLORS(np.linspace(0, 1, max(len(track) - 1, 1)))
     pieces = np.stack([track[:-1], track[1:]], 1)
-    return LineCollection(list(pieces), colors=colours, linewidths=width, capstyle="round", zorder=4)
+    return LineCollection(list(pieces), colors=colors, linewidths=width, capstyle="round", zorder=4)
 
 
 def draw_time_bar(figure: Figure, end: float, label: str, *, whole: bool = False) -> None:
-    """The legend of :data:`TIME_COLOURS`, from 0 to ``end``, with ``whole`` numbers or any."""
-    times = ScalarMappable(Normalize(0, max(end, 1e-9)), TIME_COLOURS)
+    """The legend of :data:`TIME_COLORS`, from 0 to ``end``, with ``whole`` numbers or any."""
+    times = ScalarMappable(Normalize(0, max(end, 1e-9)), TIME_COLORS)
     bar = figure.colorbar(times, cax=figure.add_axes(_BOXES["bar"]), ticks=MaxNLocator(6, integer=whole))
     bar.outline.set_visible(False)
     bar.set_label(label, color=QUIET, fontsize=9)
@@ -166,6 +166,6 @@ def role_dots(episode: Episode) -> list[Line2D]:
     return [dot(role_name(role), tuple(role_rgb(role) / 255), "none") for role in roles]
 
 
-def dot(label: str, colour: ColorType, edge: str) -> Line2D:
+def dot(label: str, color: ColorType, edge: str) -> Line2D:
     """A legend's entry of a round mark."""
-    return Line2D([], [], linestyle="", marker="o", markersize=6, color=colour, markeredgecolor=edge, label=label)
+    return Line2D([], [], linestyle="", marker="o", markersize=6, color=color, markeredgecolor=edge, label=label)

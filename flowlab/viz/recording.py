@@ -9,13 +9,13 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Bool, UInt8
 
+from flowlab.files import temporary_path
 from flowlab.geometry.transforms import rotation_from_6d
-from flowlab.records import Episode, Foreseen
-from flowlab.storage.files import temporary_path
-from flowlab.viz.colours import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
-from flowlab.viz.facts import describe
-from flowlab.viz.forecasts import EXPECTED_M, MOVES_M, Forecast, errors, forecasts
-from flowlab.viz.layout import CAMERA, DEPTH, RGB, layout, size
+from flowlab.records import Episode, FlowPrediction
+from flowlab.viz.blueprint import CAMERA, DEPTH, RGB, layout, size
+from flowlab.viz.captions import describe
+from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
+from flowlab.viz.plan_predictions import EXPECTED_M, MOVES_M, PlanPrediction, errors, plan_predictions
 from flowlab.viz.upright import in_camera_frame
 
 TRAIL_STEPS = 20
@@ -32,17 +32,17 @@ _LEGEND = (
 )
 
 
-def write_recording(
-    episode: Episode, path: Path, *, name: str, about: str = "", foreseen: Foreseen | None = None
+def write_rrd(
+    episode: Episode, path: Path, *, name: str, about: str = "", prediction: FlowPrediction | None = None
 ) -> None:
     """Write a ``.rrd`` that opens in any Rerun viewer. ``path`` is either absent, as before, or whole.
 
     ``name`` is what the viewer calls the recording; ``about`` is Markdown put above the facts in its info panel.
-    What a policy has ``foreseen`` is drawn from the step of each plan to that of the next.
-    All positions are metres in the world frame of the episode.
+    What a policy has ``prediction`` is drawn from the step of each plan to that of the next.
+    All positions are meters in the world frame of the episode.
     """
     recording = rr.RecordingStream("flowlab")
-    plans = [] if foreseen is None else forecasts(episode, foreseen)
+    plans = [] if prediction is None else plan_predictions(episode, prediction)
     off = list(errors(plans))
     temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,8 +89,8 @@ def _send_info(recording: rr.RecordingStream, text: str) -> None:
 def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
     steps = range(len(episode))
     points = [episode.point_cloud[t, : episode.point_count[t]] for t in steps]
-    colours = [cloud_rgb_at(episode, t) for t in steps]
-    columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colours))
+    colors = [cloud_rgb_at(episode, t) for t in steps]
+    columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colors))
     recording.send_columns("/world/cloud", _times(episode), columns.partition([len(p) for p in points]))
     recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * size(episode)), static=True)
 
@@ -112,13 +112,13 @@ def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
-    """The colours at every step, darker where the camera does not see the point."""
+    """The colors at every step, darker where the camera does not see the point."""
     return (rgb * np.where(visible, 1.0, _HIDDEN_LIGHT)[..., None]).astype(np.uint8)
 
 
-def _send_forecasts(recording: rr.RecordingStream, episode: Episode, plans: Sequence[Forecast]) -> None:
+def _send_forecasts(recording: rr.RecordingStream, episode: Episode, plans: Sequence[PlanPrediction]) -> None:
     """The paths that each plan expects; one that expects none clears those of the plan before."""
-    drawn = [plan.expected_world[:, plan.stirs].swapaxes(0, 1) for plan in plans]
+    drawn = [plan.expected_world[:, plan.predicted_moving].swapaxes(0, 1) for plan in plans]
     times = _times(episode, [plan.step for plan in plans])
     counts = [len(paths) for paths in drawn]
     strips = rr.LineStrips3D.columns(strips=[path for paths in drawn for path in paths])
@@ -173,25 +173,25 @@ def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
 def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
     for group, table in (("state", episode.state), ("action", episode.action)):
         for k, column in enumerate(table.T):
-            colour = SERIES_RGB[k % len(SERIES_RGB)]
-            _send_line(recording, episode, f"{group}/{k}", column, name=f"{group} {k}", colour=colour)
-    _send_line(recording, episode, "success", episode.success.astype(float), name="success", colour=SUCCESS_RGB)
+            color = SERIES_RGB[k % len(SERIES_RGB)]
+            _send_line(recording, episode, f"{group}/{k}", column, name=f"{group} {k}", color=color)
+    _send_line(recording, episode, "success", episode.success.astype(float), name="success", color=SUCCESS_RGB)
     if episode.tracks.quality is not None:
         M = episode.queries.count
         median, p90 = np.percentile(1000 * episode.tracks.quality.sigma[:, :M], [50, 90], axis=1)
         seen = 100 * episode.tracks.visible[:, :M].mean(1)
-        for key, values, name, colour in [
+        for key, values, name, color in [
             ("sigma_median", median, "σ median [mm]", SIGMA_RGB[0]),
             ("sigma_p90", p90, "σ 90th percentile [mm]", SIGMA_RGB[2]),
             ("visible", seen, "in sight [%]", SUCCESS_RGB),
         ]:
-            _send_line(recording, episode, f"quality/{key}", values, name=name, colour=colour)
+            _send_line(recording, episode, f"quality/{key}", values, name=name, color=color)
 
 
 def _send_flow_error(recording: rr.RecordingStream, episode: Episode, off: Sequence[tuple[int, float]]) -> None:
     steps, error = zip(*off, strict=True)
     values, name = 1000 * np.array(error), "flow error [mm]"
-    _send_line(recording, episode, "flow_error", values, name=name, colour=PREDICTED_RGB, steps=steps)
+    _send_line(recording, episode, "flow_error", values, name=name, color=PREDICTED_RGB, steps=steps)
 
 
 def _send_line(
@@ -201,9 +201,9 @@ def _send_line(
     values: np.ndarray,
     *,
     name: str,
-    colour: tuple[int, ...],
+    color: tuple[int, ...],
     steps: Sequence[int] | None = None,
 ) -> None:
     """One line of a plot: a value for each of some steps, or of all."""
-    recording.log(f"/scalars/{key}", rr.SeriesLines(names=name, colors=colour, widths=1.5), static=True)
+    recording.log(f"/scalars/{key}", rr.SeriesLines(names=name, colors=color, widths=1.5), static=True)
     recording.send_columns(f"/scalars/{key}", _times(episode, steps), rr.Scalars.columns(scalars=values))

@@ -9,23 +9,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flowlab.records import Episode
-from flowlab.viz.colours import SIGMA_LIMIT, cloud_rgb_at, role_rgb, sigma_rgb
-from flowlab.viz.facts import caption, moving
+from flowlab.viz.captions import caption, moving
+from flowlab.viz.colors import SIGMA_LIMIT, cloud_rgb_at, role_rgb, sigma_rgb
 from flowlab.viz.panels import (
     LEFT,
     QUIET,
-    TIME_COLOURS,
+    TIME_COLORS,
     SideView,
     as_picture,
     dot,
     draw_cloud,
     draw_time_bar,
     fit,
-    head,
     legend,
     panels,
     role_dots,
     save,
+    set_title,
     trail,
 )
 from flowlab.viz.upright import hangs, upright_pixels
@@ -45,7 +45,7 @@ def draw_still(episode: Episode, path: Path, *, title: str, note: str = "") -> N
 
 def compose(episode: Episode, title: str, note: str = "") -> Figure:
     """The figure of :func:`draw_still`. Its first two axes are the camera's view, in pixels of the camera
-    turned upright, and the side view, in metres of the world frame."""
+    turned upright, and the side view, in meters of the world frame."""
     figure, camera, side = panels(title, caption(episode, len(_drawn_trails(episode))))
     _draw_camera_view(camera, episode)
     _draw_side_view(side, episode)
@@ -68,7 +68,7 @@ def _draw_camera_view(axes: Axes, episode: Episode) -> None:
     tracks = upright_pixels(episode.camera, episode.tracks.xyz_world[:, : episode.queries.count])
     _draw_scene(axes, episode, upright_pixels(episode.camera, cloud), depth, tracks)
     as_picture(axes)
-    head(axes, "first cloud and tracks, from the camera" + (" (turned upright)" if hangs(episode.camera) else ""))
+    set_title(axes, "first cloud and tracks, from the camera" + (" (turned upright)" if hangs(episode.camera) else ""))
 
 
 def _draw_side_view(axes: Axes, episode: Episode) -> None:
@@ -78,7 +78,7 @@ def _draw_side_view(axes: Axes, episode: Episode) -> None:
     view = SideView(episode.camera, tracks, tracks[:, moves] if moves.any() else tracks)
     _draw_scene(axes, episode, view.project(cloud), view.away(cloud), view.project(tracks))
     view.label(axes)
-    head(axes, f"the same, seen from {view.name}")
+    set_title(axes, f"the same, seen from {view.name}")
 
 
 def _draw_scene(
@@ -99,13 +99,11 @@ def _draw_scene(
     for k in drawn:
         axes.add_collection(trail(tracks[:, k]), autolim=False)
     axes.scatter(start[0, drawn], start[1, drawn], 14, c="white", edgecolors=ink[drawn], linewidths=1, zorder=5)
-    axes.scatter(
-        end[0, drawn], end[1, drawn], 17, color=TIME_COLOURS(1.0), edgecolors="white", linewidths=0.6, zorder=6
-    )
+    axes.scatter(end[0, drawn], end[1, drawn], 17, color=TIME_COLORS(1.0), edgecolors="white", linewidths=0.6, zorder=6)
 
 
 def _ink(episode: Episode) -> Float[np.ndarray, "M 3"]:
-    """The colour of every distinct query point's dot: by its median stated error, or by role."""
+    """The color of every distinct query point's dot: by its median stated error, or by role."""
     count, quality = episode.queries.count, episode.tracks.quality
     rgb = role_rgb(episode.query_role) if quality is None else sigma_rgb(np.median(quality.sigma, axis=0))
     return rgb[:count] / 255 * 0.8
@@ -117,5 +115,5 @@ def _draw_legend(figure: Figure, episode: Episode) -> None:
         sigmas = np.array([0, 0.5, 1]) * SIGMA_LIMIT
         names = [f"σ = {1000 * x:.0f} mm" for x in sigmas[:2]] + [f"≥ {1000 * SIGMA_LIMIT:.0f} mm"]
         dots = [dot(name, tuple(0.8 * sigma_rgb(x) / 255), "none") for name, x in zip(names, sigmas, strict=True)]
-    dots += [dot("start", "white", QUIET), dot("end", TIME_COLOURS(1.0), "none")]
+    dots += [dot("start", "white", QUIET), dot("end", TIME_COLORS(1.0), "none")]
     legend(figure, dots)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from flowlab.errors import DataError
-from flowlab.records import Episode, Foreseen
-from flowlab.storage.files import temporary_path
+from flowlab.files import temporary_path
+from flowlab.records import Episode, FlowPrediction
+from flowlab.viz.caption_bar import CaptionBar
 from flowlab.viz.overlay import Overlay
-from flowlab.viz.strip import Strip
 from flowlab.viz.upright import hangs
 
 WIDTH = 640
@@ -29,20 +29,20 @@ def write_video(
     trail_s: float = 0.5,
     title: str = "",
     note: str = "",
-    foreseen: Foreseen | None = None,
+    prediction: FlowPrediction | None = None,
 ) -> None:
     """Write an H.264 ``.mp4`` that browsers play, a frame per step. ``path`` is either absent, as before, or whole.
 
-    Every query point is drawn where its track is in the colour picture, or in the depth picture where there is
-    no colour; by default in real time, with trails over the last half second. ``title`` is said instead of task
-    and seed; ``note`` stands below, in red. The paths that a policy has ``foreseen`` are drawn from the step of each
+    Every query point is drawn where its track is in the color picture, or in the depth picture where there is
+    no color; by default in real time, with trails over the last half second. ``title`` is said instead of task
+    and seed; ``note`` stands below, in red. The paths that a policy has ``prediction`` are drawn from the step of each
     plan to that of the next. Raises :class:`DataError` where the episode has no pictures.
     """
-    pictures = Pictures(episode)
+    pictures = VideoFrames(episode)
     rate = Fraction(mean_fps(episode) if fps is None else fps).limit_denominator(1000)
-    overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))), foreseen)
+    overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))), prediction)
     name, width = title or f"{episode.task}, seed {episode.seed}", pictures.scale * episode.camera.width
-    strip = Strip(episode, width, name, note, predicted=foreseen is not None)
+    strip = CaptionBar(episode, width, name, note, predicted=prediction is not None)
     temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -58,16 +58,16 @@ def mean_fps(episode: Episode) -> float:
     return (len(episode) - 1) / seconds if seconds > 0 else _ONE_FRAME_FPS
 
 
-class Pictures:
-    """The pictures of an episode, upright and enlarged by a whole factor: colour, or else grey depth."""
+class VideoFrames:
+    """The pictures of an episode, upright and enlarged by a whole factor: color, or else gray depth."""
 
     def __init__(self, episode: Episode) -> None:
         if episode.rgb is None and episode.depth is None:
             simulated = episode.tracks.quality is None
             how = "--renderer gl --set expert.scene.rgb=true" if simulated else "--set write.rgb=true"
             raise DataError(
-                f"{episode.task}, seed {episode.seed}: the dataset holds neither colour nor depth pictures to draw on; "
-                f"make it anew, into a new folder, with {how} (colour) or --set write.depth=true"
+                f"{episode.task}, seed {episode.seed}: the dataset holds neither color nor depth pictures to draw on; "
+                f"make it anew, into a new folder, with {how} (color) or --set write.depth=true"
             )
         self._episode = episode
         self.scale = -(-WIDTH // episode.camera.width)
@@ -79,18 +79,18 @@ class Pictures:
         import cv2
 
         camera, rgb = self._episode.camera, self._episode.rgb
-        picture = self._grey_depth(t) if rgb is None else rgb[t]
+        picture = self._gray_depth(t) if rgb is None else rgb[t]
         if hangs(camera):
             picture = picture[::-1, ::-1]
         size = camera.width * self.scale, camera.height * self.scale
         return np.asarray(cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
-    def _grey_depth(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
+    def _gray_depth(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
         """What is near is bright; what has no depth, black."""
         assert self._episode.depth is not None
         depth, (near, far) = self._episode.depth[t], self._near_far
-        grey = np.interp(depth, [near, far], [225, 50]) * (depth > 0)
-        return np.repeat(grey.astype(np.uint8)[..., None], 3, -1)
+        gray = np.interp(depth, [near, far], [225, 50]) * (depth > 0)
+        return np.repeat(gray.astype(np.uint8)[..., None], 3, -1)
 
 
 def _depth_range(episode: Episode) -> tuple[float, float]:
@@ -100,7 +100,7 @@ def _depth_range(episode: Episode) -> tuple[float, float]:
     return float(near), float(max(far, near + 1e-3))
 
 
-def _frame(pictures: Pictures, overlay: Overlay, strip: Strip, t: int) -> UInt8[np.ndarray, "h w 3"]:
+def _frame(pictures: VideoFrames, overlay: Overlay, strip: CaptionBar, t: int) -> UInt8[np.ndarray, "h w 3"]:
     """One frame of the film, of even height and width, as yuv420p needs."""
     picture = pictures.draw(t)
     overlay.draw(picture, t)

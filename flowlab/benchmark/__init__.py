@@ -1,0 +1,1 @@
+"""Experiments, and what their results add up to."""

@@ -1,0 +1,75 @@
+"""What a dry run says of recordings: JSON values, or lines for people."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from flowlab.errors import DataError
+from flowlab.recordings.recording import Description, StreamInfo
+
+_SHOWN = 5
+"""Bad frames that people are shown of one recording; JSON has all."""
+
+
+def facts_of(found: Description | DataError) -> dict[str, Any]:
+    """What was recognized of a recording, or only its problem."""
+    if isinstance(found, DataError):
+        return {"problem": str(found)}
+    return {
+        "reader": found.reader,
+        "rows": found.rows,
+        "streams": [_stream(s) for s in found.streams],
+        "sync_ms": {name: [round(1e3 * s, 2) for s in both] for name, both in found.sync_s.items()},
+        "color_size": list(found.color_size),
+        "depth_size": list(found.depth_size),
+        "frame_size": None if found.frame_size is None else list(found.frame_size),
+        "depth_unit_m": found.depth_unit_m,
+        "calibration": dict(found.origin),
+        "state_width": found.state_width,
+        "action_width": found.action_width,
+        "bad_frames": [[b.name, b.reason] for b in found.bad],
+        "notes": list(found.notes),
+        "problem": found.problem,
+    }
+
+
+def _stream(s: StreamInfo) -> dict[str, Any]:
+    about = {"stream": s.name, "count": s.count, "fps": round(s.fps, 2)}
+    return {**about, "first_s": s.first_s, "last_s": s.last_s, "gaps_s": [list(gap) for gap in s.gaps]}
+
+
+def lines_of(facts: dict[str, Any]) -> Iterator[str]:
+    """The same for people: first the recording, then a line for everything known of it."""
+    rows = f", {facts['rows']} rows, read as a {facts['reader']} recording" if "reader" in facts else ""
+    yield f"{facts['recording']}: task '{facts['task']}'{rows}"
+    if "reader" in facts:
+        for name, value in _known(facts):
+            yield f"  {name:<12} {value}"
+    if facts["problem"]:
+        yield f"  {'problem':<12} {facts['problem']}"
+
+
+def _known(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for s in facts["streams"]:
+        yield s["stream"], f"{s['count']} at {s['fps']:g} per second, {_gaps(s['gaps_s'])}"
+    for name, (median, most) in facts["sync_ms"].items():
+        yield "sync", f"{name} is {median:g} ms from its color frame in the median, {most:g} ms at most"
+    yield "pictures", ", ".join(f"{what} {'x'.join(map(str, facts[f'{what}_size']))}" for what in ("color", "depth"))
+    yield "depth unit", f"{facts['depth_unit_m']} m" if facts["depth_unit_m"] else "not known"
+    places: dict[str, list[str]] = {}
+    for key, place in facts["calibration"].items():
+        places.setdefault(place, []).append(key)
+    yield "known", "; ".join(f"{', '.join(keys)} from {place}" for place, keys in places.items()) or "nothing else"
+    yield "robot", f"state of {facts['state_width']} numbers, action of {facts['action_width']}"
+    for name, reason in facts["bad_frames"][:_SHOWN]:
+        yield "bad frame", f"{name}: {reason}"
+    if len(facts["bad_frames"]) > _SHOWN:
+        yield "bad frames", f"{len(facts['bad_frames']) - _SHOWN} more; --json lists all"
+    for note in facts["notes"]:
+        yield "note", note
+
+
+def _gaps(gaps: list[list[float]]) -> str:
+    if not gaps:
+        return "no gaps"
+    start, length = max(gaps, key=lambda gap: gap[1])
+    return f"{len(gaps)} gaps, the longest of {length:.2f} s at {start:.2f} s"

@@ -1,0 +1,1 @@
+"""Where work units run: engines, and the one on this machine."""

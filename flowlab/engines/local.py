@@ -1,0 +1,126 @@
+"""Where work units run. The pool on this machine is one engine; a cluster's would be another."""
+
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Generic, Protocol, Self, TypeVar
+
+from pebble import ProcessExpired, ProcessPool
+
+from flowlab.errors import FlowlabError
+from flowlab.files import is_running
+
+Unit = TypeVar("Unit")
+Receipt = TypeVar("Receipt")
+
+_WORKER_ENVIRONMENT = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "LP_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "MALLOC_ARENA_MAX",
+)
+"""All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnitResult(Generic[Unit, Receipt]):
+    """What became of a unit: its receipt, or why there is none."""
+
+    unit: Unit
+    receipt: Receipt | None
+    failure: str = ""
+    """Traceback, or how the worker died."""
+
+
+class Engine(Protocol[Unit, Receipt]):
+    """Runs units of some kind and hands back outcomes as they come; units never exchange arrays through it."""
+
+    def submit(self, unit: Unit) -> None:
+        """Start a unit as soon as there is room."""
+        ...
+
+    def next_result(self) -> UnitResult[Unit, Receipt]:
+        """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
+        ...
+
+
+StartEngine = Callable[[Callable[[Unit], Receipt]], AbstractContextManager[Engine[Unit, Receipt]]]
+"""Makes an engine that does units with the given function; leaving the context stops it."""
+
+
+class LocalEngine(Generic[Unit, Receipt]):
+    """A pool of processes on this machine.
+
+    A worker that dies loses its own unit only, which is tried once more in a fresh worker. ``imports`` are the modules
+    that they will need.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Unit], Receipt],
+        workers: int,
+        imports: Sequence[str] = ("flowlab.pipeline.stages.simulation",),
+    ) -> None:
+        self._work, self._workers, self._imports = work, workers, imports
+        self._tries: dict[Future[Receipt], tuple[Unit, int]] = {}
+
+    def __enter__(self) -> Self:
+        for name in _WORKER_ENVIRONMENT:
+            os.environ.setdefault(name, "1")
+        # Workers are forked from a clean process that has imported everything once, and share its memory.
+        context = get_context("forkserver")
+        context.set_forkserver_preload(["flowlab.pipeline.worker", *self._imports])
+        self._pool = ProcessPool(
+            max_workers=self._workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
+        )
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._pool.stop()
+        self._pool.join()
+
+    def submit(self, unit: Unit) -> None:
+        """Start a unit as soon as a worker is free."""
+        self._schedule(unit, tries=1)
+
+    def next_result(self) -> UnitResult[Unit, Receipt]:
+        """Wait for a unit to end."""
+        while True:
+            done, _ = wait(self._tries, return_when=FIRST_COMPLETED)
+            future = done.pop()
+            unit, tries = self._tries.pop(future)
+            try:
+                return UnitResult(unit, future.result())
+            except ProcessExpired as death:
+                if tries == 1:
+                    self._schedule(unit, tries=2)
+                    continue
+                return UnitResult(unit, None, f"its worker died twice (exit code {death.exitcode})")
+            except (FlowlabError, OSError):
+                raise
+            except Exception as error:
+                return UnitResult(unit, None, "".join(traceback.format_exception(error)))
+
+    def _schedule(self, unit: Unit, tries: int) -> None:
+        self._tries[self._pool.schedule(self._work, args=[unit])] = unit, tries
+
+
+def _start_worker(program: int) -> None:
+    """Leave Ctrl-C to the program, and end with it, however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while is_running(program):
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,184 @@
+"""Grading: recordings whose truth is known, labeled without it, and compared with it."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from flowlab.errors import DataError
+from flowlab.geometry.transforms import apply, inverse
+from flowlab.grading import ground_truth
+from flowlab.grading.ground_truth import GroundTruth
+from flowlab.grading.metrics import (
+    Calibration,
+    Estimate,
+    MetricSettings,
+    TrackMetrics,
+    average,
+    calibrate,
+    errors_m,
+    measure,
+)
+from flowlab.grading.simulate import unusable_queries
+from flowlab.recordings.recording import RecordingSettings, open_recording
+from flowlab.records import Clip
+from flowlab.tracking.base import Tracker
+from flowlab.tracking.chunking import ChunkSettings
+from flowlab.tracking.labeling import label_clip
+from flowlab.tracking.lifting import LiftSettings
+
+_FULL_SIZE_PX = 1 << 20
+"""Wider than any picture, so that none is shrunk: the truth's pixels are those of the files."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grade:
+    """One recording, labeled by one tracker."""
+
+    recording: str
+    frames: int
+    queries: int
+    unusable_queries: int
+    """Left out of the simulated recording because of ``UNUSABLE_M``."""
+    cpu_s: float
+    """CPU time of labeling, all threads together."""
+    estimate: Estimate
+    truth: GroundTruth
+    metrics: TrackMetrics
+
+    @property
+    def ms_per_frame(self) -> float:
+        """CPU time per frame [ms]."""
+        return self.cpu_s / self.frames * 1e3
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures, without the tracks, as JSON values."""
+        facts = {name: getattr(self, name) for name in ("recording", "frames", "queries", "unusable_queries")}
+        times = {"cpu_s": round(self.cpu_s, 3), "ms_per_frame": round(self.ms_per_frame, 2)}
+        return {**facts, **times, "metrics": self.metrics.to_json()}
+
+
+@dataclass(frozen=True, slots=True)
+class Grades:
+    """All recordings, labeled by one tracker."""
+
+    tracker: Mapping[str, Any]
+    """What :meth:`flowlab.tracking.base.Tracker.describe` says."""
+    rows: tuple[Grade, ...]
+    mean: TrackMetrics
+    """Over the recordings, each counting the same; the calibration is of all their points together."""
+
+    @property
+    def name(self) -> str:
+        """The tracker's."""
+        return str(self.tracker["tracker"])
+
+    @property
+    def ms_per_frame(self) -> float:
+        """CPU time per frame over all recordings [ms]."""
+        return sum(row.cpu_s for row in self.rows) / sum(row.frames for row in self.rows) * 1e3
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures as JSON values."""
+        return {
+            **self.tracker,
+            "ms_per_frame": round(self.ms_per_frame, 2),
+            "mean": self.mean.to_json(),
+            "recordings": [row.to_json() for row in self.rows],
+        }
+
+
+def grade(
+    recordings: Sequence[Path],
+    tracker: Tracker,
+    chunks: ChunkSettings,
+    lifting: LiftSettings,
+    metrics: MetricSettings = MetricSettings(),
+    report: Callable[[Grade], None] = lambda _: None,
+) -> Grades:
+    """Grade every recording; ``report`` is told of each as it is done."""
+    rows = []
+    for recording in recordings:
+        rows.append(grade_recording(recording, tracker, chunks, lifting, metrics))
+        report(rows[-1])
+    return Grades(tracker.describe(), tuple(rows), average([r.metrics for r in rows], _calibration(rows)))
+
+
+def grade_recording(
+    recording: Path,
+    tracker: Tracker,
+    chunks: ChunkSettings,
+    lifting: LiftSettings,
+    metrics: MetricSettings = MetricSettings(),
+) -> Grade:
+    """Label the true tracks' query pixels, given nothing but the pictures, and compare.
+
+    Raises :class:`DataError` where the recording's truth is missing, or is of other pictures.
+    """
+    truth = ground_truth.read(recording)
+    clip = read_clip(recording)
+    _check_same(recording, clip, truth)
+    start = time.process_time()
+    estimate = label_blind(clip, truth.query_px, tracker, chunks, lifting)
+    cpu_s = time.process_time() - start
+    return Grade(
+        recording=recording.name,
+        frames=len(clip),
+        queries=len(truth.query_px),
+        unusable_queries=unusable_queries(recording),
+        cpu_s=cpu_s,
+        estimate=estimate,
+        truth=truth,
+        metrics=measure(estimate, truth, clip.camera, metrics),
+    )
+
+
+def read_clip(recording: Path) -> Clip:
+    """All pictures of a recording, at full size. One bad picture rejects it: rows must stay those of the truth."""
+    settings = RecordingSettings(bad_frames="reject", max_width=_FULL_SIZE_PX)
+    opened = open_recording(recording, settings, task=recording.name, seed=0)
+    frames = [opened.frame(t) for t in range(len(opened))]
+    rgb = np.stack([f.rgb for f in frames if f.rgb is not None])
+    return Clip(rgb, np.stack([f.depth for f in frames]), opened.camera)
+
+
+def label_blind(
+    clip: Clip,
+    query_px: Float32[np.ndarray, "N 2"],
+    tracker: Tracker,
+    chunks: ChunkSettings,
+    lifting: LiftSettings,
+) -> Estimate:
+    """The labeling's answer for pixels of the first frame, in the camera frame."""
+    _, tracks = label_clip(clip, query_px, tracker, chunks, lifting)
+    xyz_cam = apply(inverse(clip.camera.T_world_cam), tracks.xyz_world.astype(np.float64)).astype(np.float32)
+    return Estimate(xyz_cam, tracks.visible, None if tracks.quality is None else tracks.quality.sigma)
+
+
+def _check_same(recording: Path, clip: Clip, truth: GroundTruth) -> None:
+    """Refuse truth that cannot be of these pictures."""
+    if len(truth.tracks_cam) != len(clip):
+        raise DataError(
+            f"{recording / ground_truth.FILE_NAME}: 'tracks_cam' has {len(truth.tracks_cam)} frames, and the "
+            f"recording {len(clip)}; give the truth of every frame, or take out the frames without"
+        )
+    outside = (truth.query_px < -0.5) | (truth.query_px > np.array([clip.camera.width, clip.camera.height]) - 0.5)
+    if outside.any():
+        x, y = truth.query_px[outside.any(1)][0]
+        raise DataError(
+            f"{recording / ground_truth.FILE_NAME}: 'query_px' has ({x:g}, {y:g}), outside the picture of "
+            f"{clip.camera.width} x {clip.camera.height}; pixels are (x, y), counted from 0"
+        )
+
+
+def _calibration(rows: Sequence[Grade]) -> Calibration | None:
+    """Of the points of all recordings together."""
+    stated = [(errors_m(r.estimate, r.truth), r.estimate.sigma) for r in rows if r.estimate.sigma is not None]
+    if not stated:
+        return None
+    error, sigma = (np.concatenate([of_row[1:].ravel() for of_row in column]) for column in zip(*stated, strict=True))
+    return calibrate(error, sigma)

@@ -1,0 +1,90 @@
+"""True tracks beside a recording, and how they are read: ``ground_truth.npz``."""
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int8
+from numpy.lib.npyio import NpzFile
+
+from flowlab.errors import DataError
+
+FILE_NAME = "ground_truth.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """Where the surface points seen at some pixels of the first frame truly are at every instant."""
+
+    query_px: Float32[np.ndarray, "N 2"]
+    """Pixel (x, y) of each query in the first frame, integer pixel centers."""
+    tracks_cam: Float32[np.ndarray, "T N 3"]
+    """Position in the camera frame of each instant [m]."""
+    visible: Bool[np.ndarray, "T N"]
+    """Whether the camera sees the point."""
+    role: Int8[np.ndarray, "N"] | None = None
+    """The :class:`flowlab.records.Role` of what each query lies on, -1 where it is not known. None where
+    "moving" means nothing, because it is the camera that moves."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays as they are stored, by name."""
+        named = {"query_px": self.query_px, "tracks_cam": self.tracks_cam, "visible": self.visible}
+        return named if self.role is None else {**named, "role": self.role}
+
+
+def has_ground_truth(recording: Path) -> bool:
+    """Whether a recording's folder holds true tracks."""
+    return (recording / FILE_NAME).is_file()
+
+
+def read(path: Path) -> GroundTruth:
+    """True tracks from a recording's folder, or from the file itself.
+
+    Raises :class:`DataError` where there is no such file, or it does not hold what it should.
+    """
+    path = path / FILE_NAME if path.is_dir() else path
+    try:
+        stored = np.load(path)
+        if not isinstance(stored, NpzFile):
+            raise ValueError("it holds a single array without a name")
+        with stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except FileNotFoundError as error:
+        raise DataError(
+            f"{path}: there is no such file; 'flowlab grade' needs a recording's true tracks "
+            "(query_px, tracks_cam and visible; see docs/grading.md), or --tasks to simulate recordings"
+        ) from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{path}: cannot be read ({error}); it must be an .npz file written by numpy.savez") from error
+    return _checked(path, arrays)
+
+
+def _checked(path: Path, arrays: dict[str, np.ndarray]) -> GroundTruth:
+    """The record, once every array is known to have the right shape, type and finite values."""
+    for name in ("query_px", "tracks_cam", "visible"):
+        if name not in arrays:
+            raise DataError(f"{path}: has no array '{name}'; found {', '.join(sorted(arrays)) or 'none'}")
+    query_px, tracks_cam = arrays["query_px"], arrays["tracks_cam"]
+    steps, queries = tracks_cam.shape[0] if tracks_cam.ndim else 0, query_px.shape[0] if query_px.ndim else 0
+    if not steps or not queries:
+        raise DataError(f"{path}: holds no track; tracks_cam is (frames, queries, 3), found {tracks_cam.shape}")
+    _check(path, "query_px", query_px, (queries, 2), "fiu")
+    _check(path, "tracks_cam", tracks_cam, (steps, queries, 3), "f")
+    _check(path, "visible", arrays["visible"], (steps, queries), "b")
+    role = arrays.get("role")
+    if role is not None:
+        _check(path, "role", role, (queries,), "iu")
+        role = role.astype(np.int8)
+    return GroundTruth(query_px.astype(np.float32), tracks_cam.astype(np.float32), arrays["visible"], role)
+
+
+def _check(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str) -> None:
+    if values.shape != shape:
+        raise DataError(f"{path}: '{name}' has the shape {values.shape}, expected {shape} as the other arrays say")
+    if values.dtype.kind not in kinds:
+        expected = {"f": "floats", "i": "whole numbers", "b": "booleans"}[kinds[0]]
+        raise DataError(f"{path}: '{name}' has the type {values.dtype}, expected {expected}")
+    if not np.isfinite(values).all():
+        raise DataError(f"{path}: '{name}' holds {(~np.isfinite(values)).sum()} values that are not finite")

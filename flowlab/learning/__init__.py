@@ -1,1 +1,0 @@
-"""Policies: training them, and what training needs."""

@@ -1,0 +1,1 @@
+"""The networks that policies are built from."""

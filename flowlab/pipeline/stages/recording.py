@@ -1,0 +1,130 @@
+"""The stages of recordings, with those they share. Each is a thin skin over the function that does the work."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flowlab.errors import DataError
+from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
+from flowlab.pipeline.stages.shared import ObserverStage, QueriesStage, WriteStage, labeled
+from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
+from flowlab.records import Clip, Episode, QueriedDemo, TrackedDemo
+from flowlab.tracking.base import make_tracker
+from flowlab.tracking.chunking import ChunkSettings, follow
+from flowlab.tracking.labeling import to_3d
+from flowlab.tracking.lifting import LiftSettings
+
+__all__ = [
+    "LiftStage",
+    "ObserverStage",
+    "QualityStage",
+    "QueriesStage",
+    "RecordingStage",
+    "TrackStage",
+    "WriteStage",
+]
+
+
+class RecordingStage(Stage, RecordingSettings):
+    """A recording is opened, its streams put on one time axis."""
+
+    stage: Literal["recording"] = "recording"
+
+    def process(self, record: EpisodeRequest) -> Recording:
+        """Open the recording that the request names."""
+        try:
+            return open_recording(Path(record.source), self, task=record.task, seed=record.seed)
+        except DataError as error:
+            raise Rejected(str(error)) from error
+
+
+class TrackStage(Stage):
+    """The query points are followed through the pictures."""
+
+    stage: Literal["track"] = "track"
+    tracker: str = "rigid-bodies"
+    """Name of an installed tracker."""
+    options: Mapping[str, Any] = {}
+    """The tracker's own settings."""
+    chunks: ChunkSettings = ChunkSettings()
+    """How a recording is cut for trackers that take it in parts."""
+
+    @model_validator(mode="after")
+    def _tracker_exists(self) -> Self:
+        make_tracker(self.tracker, self.options)
+        return self
+
+    def process(self, record: QueriedDemo) -> TrackedDemo:
+        """Follow the points from their pixels in the first frame."""
+        clip = clip_of(record)
+        tracker = make_tracker(self.tracker, self.options)
+        pixel, _ = clip.camera.project(record.queries.xyz_world.astype(np.float64))
+        # The points came from pixels, and rounding finds these again exactly.
+        tracks = follow(clip, np.rint(pixel).astype(np.float32), tracker, self.chunks)
+        return TrackedDemo(record, tracks, tracker.describe())
+
+
+def clip_of(record: QueriedDemo) -> Clip:
+    """What a tracker works on. Raises :class:`Rejected` for a recording without color."""
+    seen = record.observed
+    if seen.rgb is None:
+        raise Rejected("the recording has no color pictures, and points are followed in these; record color too")
+    return Clip(seen.rgb, seen.depth, seen.demo.camera)
+
+
+class LiftStage(Stage, LiftSettings):
+    """Tracks in the picture become tracks in the world, with what is known of their error."""
+
+    stage: Literal["lift"] = "lift"
+
+    def process(self, record: TrackedDemo) -> Episode:
+        """Lift the tracks by every frame's depth."""
+        lifting = LiftSettings.model_validate(self.model_dump(exclude={"stage"}))
+        tracks = to_3d(clip_of(record.queried), record.tracks, lifting)
+        return labeled(record.queried, tracks, tracker=dict(record.tracker))
+
+
+class QualityStage(Stage):
+    """Keeps out episodes whose tracks are too poor to learn from; they can still be looked at."""
+
+    stage: Literal["quality"] = "quality"
+    sure_m: float = Field(default=0.05, gt=0)
+    """A position counts as sure if the camera sees the point and its stated error is below this [m]."""
+    min_sure_share: float = Field(default=0.25, ge=0, le=1)
+    """Share of all positions, over points and frames, that must be sure."""
+    max_median_sigma_m: float = Field(default=0.1, gt=0)
+    """Median stated error of visible points [m] that is still good enough."""
+    max_lost_share: float = Field(default=0.8, ge=0, le=1)
+    """Share of the points that may be lost for good, that is, not visible in the last tenth of the episode."""
+
+    def process(self, record: Episode) -> Episode:
+        """Let an episode pass whose tracks are good enough."""
+        if record.tracks.quality is None:
+            return record
+        distinct = slice(record.queries.count)
+        visible, sigma = record.tracks.visible[:, distinct], record.tracks.quality.sigma[:, distinct]
+        sure = float((visible & (sigma < self.sure_m)).mean())
+        median = float(np.median(sigma[visible])) if visible.any() else np.inf
+        lost = float((~visible[-max(1, len(visible) // 10) :].any(0)).mean())
+        complaint = ""
+        if sure < self.min_sure_share:
+            complaint = (
+                f"{sure:.0%} of all positions are seen with a stated error below {self.sure_m * 1e3:g} mm, "
+                f"at least {self.min_sure_share:.0%} asked for (quality.min_sure_share)"
+            )
+        elif median > self.max_median_sigma_m:
+            complaint = (
+                f"the median stated error of visible points is {median * 1e3:.1f} mm, "
+                f"at most {self.max_median_sigma_m * 1e3:g} mm asked for (quality.max_median_sigma_m)"
+            )
+        elif lost > self.max_lost_share:
+            complaint = (
+                f"{lost:.0%} of the points are lost for good before the end, "
+                f"at most {self.max_lost_share:.0%} asked for (quality.max_lost_share)"
+            )
+        if complaint:
+            raise Rejected(complaint, episode=record)
+        return record

@@ -1,0 +1,99 @@
+"""What was recognized of a recording, for a look before the work."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from flowlab.errors import DataError
+from flowlab.recordings.frame_check import BadFrame
+from flowlab.recordings.imaging import Size
+from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.parsed import RecordingSettings, recognize
+from flowlab.recordings.timing import gaps, rate
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInfo:
+    """One stream of a recording, in numbers."""
+
+    name: str
+    count: int
+    fps: float
+    """1 / median interval [1/s]; 0 for a single sample."""
+    first_s: float
+    """Since the first color frame [s]."""
+    last_s: float
+    gaps: tuple[tuple[float, float], ...]
+    """Start, since the first color frame, and length [s] of every interval of more than 1.5 median ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What was recognized of a recording."""
+
+    path: Path
+    reader: str
+    task: str | None
+    """What the recording itself calls its task."""
+    streams: tuple[StreamInfo, ...]
+    sync_s: Mapping[str, tuple[float, float]]
+    """Median and greatest distance in time from a color frame to its depth and to its state [s]."""
+    rows: int
+    """How many rows it would give."""
+    color_size: Size
+    depth_size: Size
+    frame_size: Size | None
+    """Of the frames given out; None where calibration is missing."""
+    depth_unit_m: float | None
+    origin: Mapping[str, str]
+    """Where each key of calibration was found, such as ``intrinsics`` and ``depth_unit_m``."""
+    metadata: Metadata
+    """Everything known of it, from all sources."""
+    state_width: int
+    action_width: int
+    bad: tuple[BadFrame, ...]
+    notes: tuple[str, ...]
+    problem: str | None
+    """Why it cannot be opened as it is; None where it can."""
+
+
+def describe(path: Path, settings: RecordingSettings) -> Description:
+    """What is recognized of a recording, even where it cannot be opened for want of calibration."""
+    source = recognize(Path(path), settings)
+    seen, streams, problem, frame_size = source.survey, source.streams, None, None
+    try:
+        camera = source.imaging(settings).camera
+        frame_size = camera.width, camera.height
+        source.check_bad_frames(settings)
+    except DataError as error:
+        problem = str(error)
+    rows = source.rows()
+    start = streams.color.time_s[0]
+    named = [("color", streams.color.time_s), ("depth", streams.depth.time_s)]
+    named += [(s.name, s.time_s) for s in (*streams.state, *streams.action)]
+    return Description(
+        path=source.path,
+        reader=source.reader.name,
+        task=source.metadata.task,
+        streams=tuple(_info(name, time_s - start) for name, time_s in named),
+        sync_s={k: (float(np.median(off)), float(off.max())) for k, off in seen.sync_s.items() if len(off)},
+        rows=len(seen.color),
+        color_size=seen.color_size,
+        depth_size=seen.depth_size,
+        frame_size=frame_size,
+        depth_unit_m=source.metadata.depth_unit_m,
+        origin=source.origin,
+        metadata=source.metadata,
+        state_width=rows.state.shape[1],
+        action_width=rows.action.shape[1],
+        bad=seen.bad,
+        notes=streams.notes,
+        problem=problem,
+    )
+
+
+def _info(name: str, time_s: Float64[np.ndarray, "N"]) -> StreamInfo:
+    return StreamInfo(name, len(time_s), rate(time_s), float(time_s[0]), float(time_s[-1]), gaps(time_s))

@@ -1,0 +1,148 @@
+"""The first pass over a recording: which frames make rows, and which are bad, by name and reason."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
+from flowlab.recordings.imaging import Size
+from flowlab.recordings.timing import nearest
+
+
+@dataclass(frozen=True, slots=True)
+class BadFrame:
+    """A color frame that makes no row."""
+
+    name: str
+    """Of the picture that is at fault, of color or of depth."""
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What was found by decoding every picture once."""
+
+    color: Int64[np.ndarray, "T"]
+    """Index of the color picture of every row."""
+    depth: Int64[np.ndarray, "T"]
+    """Index of the depth picture of every row."""
+    bad: tuple[BadFrame, ...]
+    looked_at: int
+    """How many color frames were asked for."""
+    color_size: Size
+    depth_size: Size
+    median_counts: float
+    """Median depth reading of the first good row, in counts."""
+    sync_s: Mapping[str, Float64[np.ndarray, "F"]] = field(default_factory=dict)
+    """How far from each color frame its depth and its state are, bad ones included."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What decoding one picture told."""
+
+    size: Size
+    reason: str = ""
+    """Why it is bad; empty where it is good."""
+    median: float = 0.0
+
+
+def survey(
+    streams: Streams, *, every: int, start_s: float, stop_s: float | None, max_sync_s: float, max_state_s: float
+) -> Survey:
+    """Decode every picture that is asked for, and pair them.
+
+    A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
+    depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``; and
+    where its time does not lie after the frame before.
+    """
+    frames = _selected(streams.color, every, start_s, stop_s)
+    clock = streams.color.time_s[frames]
+    match = nearest(clock, streams.depth.time_s)
+    off = np.abs(streams.depth.time_s[match] - clock)
+    off_state = {s.name: np.abs(s.time_s[nearest(clock, s.time_s)] - clock) for s in streams.state}
+    color = {int(i): _look(streams.color, int(i), _look_at_color) for i in frames}
+    depth = {int(i): _look(streams.depth, int(i), _look_at_depth) for i in np.unique(match[off <= max_sync_s])}
+    color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
+    good, bad, last = [], [], -np.inf
+    for k, (i, j) in enumerate(zip(frames.tolist(), match.tolist(), strict=True)):
+        name = streams.color.names[i]
+        fault = _fault(name, color[i], color_size)
+        if fault is None and clock[k] <= last:
+            fault = BadFrame(name, "was taken no later than the frame before it")
+        if fault is None and off[k] > max_sync_s:
+            fault = BadFrame(name, f"no depth within {_ms(max_sync_s)}: the nearest is {_ms(off[k])} away")
+        if fault is None:
+            fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state_s)
+        if fault is not None:
+            bad.append(fault)
+            continue
+        good.append((i, j))
+        last = clock[k]
+    rows = np.array(good, np.int64).reshape(-1, 2)
+    median = depth[good[0][1]].median if good else 0.0
+    sync = {"depth": off, **off_state}
+    return Survey(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync)
+
+
+def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | None) -> Int64[np.ndarray, "F"]:
+    since = color.time_s - color.time_s[0]
+    return np.flatnonzero((since >= start_s) & (since <= (np.inf if stop_s is None else stop_s)))[::every]
+
+
+def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _Look]) -> _Look:
+    try:
+        return judge(stream.read(index))
+    except BadImage as error:
+        return _Look((0, 0), str(error))
+
+
+def _look_at_color(picture: np.ndarray) -> _Look:
+    return _Look((picture.shape[1], picture.shape[0]))
+
+
+def _look_at_depth(counts: np.ndarray) -> _Look:
+    readings = counts[counts > 0]
+    readings = readings[np.isfinite(readings)]
+    size = counts.shape[1], counts.shape[0]
+    if not readings.size:
+        return _Look(size, "has no depth reading at all")
+    return _Look(size, median=float(np.median(readings[:: max(1, readings.size // 4096)])))
+
+
+def _usual_size(needs_frame: Iterable[_Look]) -> Size:
+    """The most frequent size of pictures that could be decoded."""
+    sizes = Counter(look.size for look in needs_frame if look.size != (0, 0))
+    return sizes.most_common(1)[0][0] if sizes else (0, 0)
+
+
+def _fault(name: str, look: _Look, usual: Size) -> BadFrame | None:
+    if look.reason:
+        return BadFrame(name, look.reason)
+    if look.size != usual:
+        return BadFrame(name, f"is {look.size[0]}x{look.size[1]}, the others are {usual[0]}x{usual[1]}")
+    return None
+
+
+def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: float) -> BadFrame | None:
+    for stream, off in off_state.items():
+        if off[k] > max_state_s:
+            return BadFrame(name, f"no {stream} within {_ms(max_state_s)}: the nearest is {_ms(off[k])} away")
+    return None
+
+
+def _ms(seconds: float) -> str:
+    return f"{1000 * seconds:.0f} ms"
+
+
+def side_by_side(
+    samples: tuple[SampleStream, ...],
+    clock: Float64[np.ndarray, "T"],
+    pick: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Values (T, D) float32 of several streams at every instant; D = 0 where there are none."""
+    parts = [s.values[pick(clock, s.time_s)] for s in samples]
+    return np.concatenate([np.empty((len(clock), 0), np.float32), *parts], axis=1)

@@ -1,0 +1,166 @@
+"""What is known of a recording besides its pictures: ``recording.yaml``, or one calibration file for many."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import AfterValidator, Field, ValidationError
+
+from flowlab.config import Settings
+from flowlab.errors import DataError, unknown_name
+
+FILE_NAME = "recording.yaml"
+Row = tuple[float, float, float, float]
+
+
+def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    T = np.array(rows)
+    off = np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max()
+    if not np.isfinite(T).all() or off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or tuple(rows[3]) != (0, 0, 0, 1):
+        raise ValueError(
+            "must be a rigid transform: four rows of four numbers, a rotation (determinant 1) and a position [m], "
+            "and the last row 0, 0, 0, 1"
+        )
+    return rows
+
+
+Rigid = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
+
+
+class Intrinsics(Settings):
+    """A pinhole camera, pixel centers at integer coordinates."""
+
+    fx: float = Field(gt=0)
+    """[px]"""
+    fy: float = Field(gt=0)
+    """[px]"""
+    cx: float
+    """[px]"""
+    cy: float
+    """[px]"""
+    width: int | None = Field(default=None, gt=0)
+    """Of the pictures that the numbers belong to [px]."""
+    height: int | None = Field(default=None, gt=0)
+    """[px]"""
+    distortion: tuple[float, ...] = Field(default=(), max_length=14)
+    """OpenCV's coefficients k1, k2, p1, p2, k3, ...; the pictures are undistorted where there are any."""
+
+    @property
+    def K(self) -> np.ndarray:
+        """The matrix (3, 3) [px]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], float)
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the pictures must be undistorted."""
+        return any(self.distortion)
+
+    @classmethod
+    def from_matrix(cls, K: np.ndarray, **others: Any) -> "Intrinsics":
+        """From a matrix (3, 3) or (3, 4) [px]."""
+        K = np.asarray(K, float)
+        return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], **others)
+
+    def to_yaml(self) -> str:
+        """One line of YAML."""
+        values = self.model_dump(exclude_defaults=True)
+        order = [k for k in ("width", "height", "fx", "fy", "cx", "cy", "distortion") if k in values]
+        return "{" + ", ".join(f"{k}: {_plain(values[k])}" for k in order) + "}"
+
+
+def _plain(value: Any) -> str:
+    return f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
+
+
+class Topics(Settings):
+    """Which topics of a ROS bag to read, where types and names do not tell."""
+
+    color: str | None = None
+    depth: str | None = None
+    color_info: str | None = None
+    depth_info: str | None = None
+    state: str | None = None
+    action: str | None = None
+
+
+class Metadata(Settings):
+    """The keys of ``recording.yaml``; every one is optional where the layout itself tells."""
+
+    color: str = "color"
+    """Folder of the color pictures."""
+    depth: str = "depth"
+    """Folder of the depth pictures."""
+    fps: float | None = Field(default=None, gt=0)
+    """Pictures per second, where there is no file of times."""
+    times: str | None = None
+    """File with the time of every color picture [s], one a line; of the depth pictures too without ``depth_times``."""
+    depth_times: str | None = None
+    """File with the time of every depth picture [s]."""
+    intrinsics: Intrinsics | None = None
+    """The color camera."""
+    depth_unit_m: float | None = Field(default=None, gt=0)
+    """Meters per count of the depth pictures."""
+    T_world_cam: Rigid | None = None
+    """Pose of the color camera: maps its coordinates to the world's [m]. Without it the world is the camera."""
+    depth_intrinsics: Intrinsics | None = None
+    """The depth camera, where depth is not registered to color."""
+    T_color_depth: Rigid | None = None
+    """Maps coordinates of the depth camera to those of the color camera [m]."""
+    state: str | None = None
+    """``.npy`` or ``.csv`` with a row of robot state per color picture, or per time of ``state_times``."""
+    state_times: str | None = None
+    """File with the time of every row of state [s], on the clock of the pictures."""
+    action: str | None = None
+    """Likewise, the actions."""
+    action_times: str | None = None
+    """File with the time of every row of actions [s]."""
+    success: bool = True
+    """Whether the demonstration solved its task."""
+    task: str | None = None
+    """What the robot does."""
+    camera: str | None = None
+    """Serial number of the camera to use, where a recording has several."""
+    topics: Topics = Topics()
+    """Topics of a ROS bag."""
+
+
+def load_metadata(path: Path) -> Metadata:
+    """The content of a YAML file. Raises :class:`DataError` that names the key."""
+    try:
+        values = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); it is a YAML file as docs/recordings.md"
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    if values is not None and not isinstance(values, dict):
+        raise DataError(f"{path}: must be a mapping such as 'fps: 30', found {values!r}")
+    try:
+        return Metadata.model_validate(values or {})
+    except ValidationError as error:
+        raise DataError(f"{path}: {_explain(error)}") from error
+
+
+def _explain(error: ValidationError) -> str:
+    # A key misspelt is why another is missing, so it is named first.
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    where = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        inner: dict[str, type[Settings]] = {"intrinsics": Intrinsics, "depth_intrinsics": Intrinsics, "topics": Topics}
+        model = inner.get(str(first["loc"][0]), Metadata) if len(first["loc"]) > 1 else Metadata
+        return str(unknown_name("key", str(first["loc"][-1]), model.model_fields))
+    return f"{where}: {first['msg'].removeprefix('Value error, ')} (found {first['input']!r})"
+
+
+def combine(sources: Iterable[tuple[str, Metadata]]) -> tuple[Metadata, dict[str, str]]:
+    """One from several, the first that has a key winning; and where each key came from."""
+    values: dict[str, Any] = {}
+    origin: dict[str, str] = {}
+    for name, metadata in sources:
+        for key in metadata.model_fields_set:
+            if key not in values and getattr(metadata, key) is not None:
+                values[key], origin[key] = getattr(metadata, key), name
+    return Metadata(**values), origin

@@ -1,0 +1,168 @@
+"""One episode as arrays, as diffusion policies keep them: an ``.npz`` file, or a folder of ``.npy`` files."""
+
+import tempfile
+import zipfile
+import zlib
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from flowlab.errors import DataError
+from flowlab.recordings.base import ImageStream, SampleStream, Streams
+from flowlab.recordings.image_files import check_depth
+from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
+from flowlab.recordings.sample_files import check_times
+
+NAMES = {
+    "color": ("color", "rgb", "img", "image", "images", "colors"),
+    "depth": ("depth", "depths", "depth_img"),
+    "cloud": ("point_cloud", "pointcloud", "points", "cloud"),
+    "state": ("state", "agent_pos", "robot_state", "qpos"),
+    "action": ("action", "actions"),
+    "time": ("time", "time_s", "timestamp", "timestamps"),
+    "intrinsics": ("intrinsics", "K"),
+    "ends": ("episode_ends",),
+}
+"""What arrays may be called, by what they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Store:
+    """Where arrays lie; pictures are mapped into memory, not read."""
+
+    path: Path
+    names: dict[str, str]
+    """Name of each array there is, by what it is."""
+    unpacked: "tempfile.TemporaryDirectory[str] | None"
+
+    def load(self, what: str) -> np.ndarray | None:
+        """An array by what it is; None where there is none."""
+        if what not in self.names:
+            return None
+        name = self.names[what]
+        try:
+            if self.unpacked is None:
+                return np.load(self.path / f"{name}.npy", mmap_mode="r")
+            with zipfile.ZipFile(self.path) as file:
+                return np.load(file.extract(f"{name}.npy", self.unpacked.name), mmap_mode="r")
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise DataError(f"{self.path}: its array '{name}' cannot be read ({error})") from error
+
+
+class ArraysReader:
+    """Reads arrays with a row per step."""
+
+    name = "arrays"
+    looks_for = "an .npz file or a folder of .npy files with color and depth (img and depth, say)"
+    general = False
+
+    def probe(self, path: Path) -> bool:
+        """Whether arrays of pictures, or of clouds, are there by name."""
+        found = _find(path)
+        return "cloud" in found or ("color" in found and "depth" in found)
+
+    def read(self, path: Path, given: Metadata) -> Streams:
+        """The streams. Arrays of clouds alone are refused, for points have no identity to track."""
+        names = _find(path)
+        missing = [what for what in ("color", "depth") if what not in names]
+        if missing and "cloud" in names:
+            raise DataError(
+                f"{path}: holds point clouds ('{names['cloud']}') but no color and depth pictures; tracks cannot be "
+                "made from clouds, so record or keep the pictures"
+            )
+        if missing:
+            raise DataError(f"{path}: has no array for {missing[0]}; it may be called {', '.join(NAMES[missing[0]])}")
+        store = _Store(path, names, None if path.is_dir() else tempfile.TemporaryDirectory(prefix="flowlab-"))
+        color, depth = store.load("color"), store.load("depth")
+        assert color is not None
+        assert depth is not None
+        _check(store, names, color, depth)
+        time_s = _times(store, len(color), given)
+        K = store.load("intrinsics")
+        known = () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
+        return Streams(
+            ImageStream(_called(names["color"], len(color)), time_s, partial(_color, store, color)),
+            ImageStream(_called(names["depth"], len(depth)), time_s, partial(_depth, store, depth)),
+            state=_samples(store, "state", time_s),
+            action=_samples(store, "action", time_s),
+            known=known,
+        )
+
+
+def _find(path: Path) -> dict[str, str]:
+    """What arrays there are, by name; nothing is read of them."""
+    if path.suffix == ".npz" and path.is_file():
+        try:
+            with zipfile.ZipFile(path) as file:
+                present = {n.removesuffix(".npy") for n in file.namelist()}
+        except (OSError, zipfile.BadZipFile):
+            return {}
+    elif path.is_dir():
+        present = {f.stem for f in path.glob("*.npy")}
+    else:
+        return {}
+    return {what: name for what, names in NAMES.items() for name in reversed(names) if name in present}
+
+
+def _called(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}[{k}]" for k in range(count))
+
+
+def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.ndarray) -> None:
+    path, ends = store.path, store.load("ends")
+    if ends is not None and np.size(ends) > 1:
+        raise DataError(f"{path}: holds {np.size(ends)} episodes, one after the other; write one file per episode")
+    if color.ndim != 4 or 3 not in (color.shape[-1], color.shape[1]):
+        raise DataError(f"{path}: '{names['color']}' has the shape {color.shape}, expected (steps, height, width, 3)")
+    if color.dtype != np.uint8:
+        raise DataError(f"{path}: '{names['color']}' has the type {color.dtype}, expected uint8, 0 to 255, RGB")
+    if len(color) != len(depth) or depth.ndim not in (3, 4):
+        raise DataError(
+            f"{path}: '{names['depth']}' has the shape {depth.shape}, expected ({len(color)}, height, width)"
+        )
+    if not len(color):
+        raise DataError(f"{path}: has no steps")
+
+
+def _color(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
+    picture = np.asarray(pictures[index])
+    return np.ascontiguousarray(picture if picture.shape[-1] == 3 else picture.transpose(1, 2, 0))
+
+
+def _depth(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
+    return check_depth(np.array(pictures[index]))
+
+
+def _times(store: _Store, steps: int, given: Metadata) -> np.ndarray:
+    time_s = store.load("time")
+    if time_s is not None:
+        if time_s.shape != (steps,):
+            raise DataError(f"{store.path}: '{store.names['time']}' has the shape {time_s.shape}, expected ({steps},)")
+        return check_times(store.path, np.asarray(time_s, np.float64))
+    if given.fps is None:
+        where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name
+        raise DataError(f"{store.path}: has no times; write 'fps: 10' (steps per second) into {where}")
+    return np.arange(steps) / given.fps
+
+
+def _samples(store: _Store, what: str, time_s: np.ndarray) -> tuple[SampleStream, ...]:
+    values = store.load(what)
+    if values is None:
+        return ()
+    if values.ndim != 2 or len(values) != len(time_s) or values.dtype.kind not in "fiu":
+        raise DataError(
+            f"{store.path}: '{store.names[what]}' is {values.dtype} {values.shape}, "
+            f"expected numbers ({len(time_s)}, width)"
+        )
+    if not np.isfinite(values).all():
+        raise DataError(f"{store.path}: '{store.names[what]}' holds values that are not finite")
+    return (SampleStream(what, time_s, np.asarray(values, np.float32)),)
+
+
+def _known(path: Path, K: np.ndarray) -> Metadata:
+    K = np.asarray(K, float)
+    if K.shape[-2:] != (3, 3):
+        raise DataError(f"{path}: the intrinsics have the shape {K.shape}, expected (3, 3)")
+    return Metadata(intrinsics=Intrinsics.from_matrix(K.reshape(-1, 3, 3)[0]))

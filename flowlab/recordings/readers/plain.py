@@ -1,0 +1,122 @@
+"""The plain folder: ``color/``, ``depth/`` and a ``recording.yaml``; what flowlab itself writes."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from flowlab.errors import DataError
+from flowlab.recordings.base import Streams
+from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
+from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, load_metadata
+from flowlab.recordings.sample_files import load_times
+from flowlab.recordings.writing import write_rgbd_recording
+
+__all__ = ["PlainReader", "write_rgbd_recording"]
+
+
+class PlainReader:
+    """Reads folders of color and depth pictures."""
+
+    name = "plain"
+    looks_for = f"a folder with color/, depth/ and {FILE_NAME}"
+    general = True
+
+    def probe(self, path: Path) -> bool:
+        """Whether it has the two folders, which ``recording.yaml`` may call otherwise."""
+        folders = Metadata()
+        if (path / FILE_NAME).is_file():
+            try:
+                folders = load_metadata(path / FILE_NAME)
+            except DataError:
+                return True  # so that reading it says what is wrong
+        return (path / folders.color).is_dir() and (path / folders.depth).is_dir()
+
+    def read(self, path: Path, given: Metadata) -> Streams:
+        """The streams; their times are the numbers in the names over ``fps``, or from files."""
+        known = open3d_calibration(path)
+        fps = given.fps or next((m.fps for _, m in known if m.fps), None)
+        return read_folder(path, given, fps, known)
+
+
+def read_folder(path: Path, given: Metadata, fps: float | None, known: tuple[tuple[str, Metadata], ...]) -> Streams:
+    """The streams of a folder with two folders of pictures."""
+    color = _list(path, "color", given.color, COLOR_SUFFIXES)
+    depth = _list(path, "depth", given.depth, DEPTH_SUFFIXES)
+    if given.times is not None:
+        color_s = _timed(path / given.times, color)
+        depth_s = _timed(path / (given.depth_times or given.times), depth)
+    elif fps is not None:
+        color_s, depth_s = _numbered(path, color, depth, fps)
+    else:
+        raise DataError(
+            f"{path}: when the pictures were taken is not known; write into {path / FILE_NAME} 'fps: 30', or "
+            "'times: times.txt' for a file with the time of every color picture in seconds, one a line"
+        )
+    return Streams(color_stream(color, color_s), depth_stream(depth, depth_s), known=known)
+
+
+def open3d_calibration(path: Path) -> tuple[tuple[str, Metadata], ...]:
+    """What Open3D's recorder and bag reader write beside the pictures: ``intrinsic.json``."""
+    for name in ("intrinsic.json", "camera_intrinsic.json"):
+        file = path / name
+        if not file.is_file():
+            continue
+        try:
+            values = json.loads(file.read_text())
+            K = np.array(values["intrinsic_matrix"], float).reshape(3, 3).T  # Open3D writes it by columns
+            size = {"width": int(values["width"]), "height": int(values["height"])}
+            found = {"intrinsics": Intrinsics.from_matrix(K, **size)}
+            scale = values.get("depth_scale")
+            extra = {"fps": values.get("fps"), "depth_unit_m": float(f"{1 / scale:.6g}") if scale else None}
+            return ((name, Metadata(**found, **{k: v for k, v in extra.items() if v})),)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{file}: is not what Open3D writes ({error}); give 'intrinsics' in {FILE_NAME}") from error
+    return ()
+
+
+def _list(path: Path, what: str, folder: str, suffixes: tuple[str, ...]) -> list[Path]:
+    if not (path / folder).is_dir():
+        raise DataError(
+            f"{path}: has no folder '{folder}'; name that of the {what} pictures in {FILE_NAME}, '{what}: ...'"
+        )
+    found = list_images(path / folder, suffixes)
+    if not found:
+        raise DataError(f"{path / folder}: has no {what} pictures; expected {', '.join(suffixes)}")
+    return found
+
+
+def _timed(file: Path, pictures: list[Path]) -> Float64[np.ndarray, "N"]:
+    time_s = load_times(file)
+    if len(time_s) != len(pictures):
+        raise DataError(
+            f"{file}: has {len(time_s)} times for {len(pictures)} pictures in {pictures[0].parent.name}/; "
+            "give one a picture, and depth its own file with 'depth_times' where its pictures are others"
+        )
+    return time_s
+
+
+def _numbered(path: Path, color: list[Path], depth: list[Path], fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times of pictures by the number in their names, so that a missing one is a gap; else by their order."""
+    numbers = [_numbers(files) for files in (color, depth)]
+    if numbers[0] is not None and numbers[1] is not None:
+        return (numbers[0] - numbers[0][0]) / fps, (numbers[1] - numbers[0][0]) / fps
+    if len(color) != len(depth):
+        raise DataError(
+            f"{path}: {len(color)} color and {len(depth)} depth pictures cannot be paired, for their names do not "
+            "count frames; number them, or give 'times' and 'depth_times'"
+        )
+    order = np.arange(len(color)) / fps
+    return order, order
+
+
+def _numbers(files: list[Path]) -> np.ndarray | None:
+    """The last number of each name, where these count frames: rising, and not more than half missing."""
+    found = [re.findall(r"\d+", f.stem) for f in files]
+    if not all(found) or any(len(f[-1]) > 9 for f in found):
+        return None
+    numbers = np.array([int(f[-1]) for f in found], np.float64)
+    counts = (np.diff(numbers) > 0).all() and numbers[-1] - numbers[0] < 2 * len(files)
+    return numbers if counts else None

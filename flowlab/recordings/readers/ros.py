@@ -1,0 +1,219 @@
+"""ROS 1 bags and ROS 2 recordings (mcap, db3), through the ``rosbags`` package."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowlab.errors import DataError
+from flowlab.recordings.base import ImageStream, SampleStream, Streams
+from flowlab.recordings.metadata import FILE_NAME, Metadata
+from flowlab.recordings.readers.realsense import is_sdk_bag
+from flowlab.recordings.readers.ros_bag import BagIndex, RosBag
+from flowlab.recordings.readers.ros_messages import (
+    camera_of,
+    decode_image,
+    flatten,
+    is_color,
+    is_depth,
+    relative_pose,
+    unit_of,
+)
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO = "sensor_msgs/msg/CameraInfo"
+JOINTS = "sensor_msgs/msg/JointState"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+REGISTERED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_color")
+"""What the topics of depth that is seen from the color camera are called."""
+COMPRESSED = ("compressed", "compressedDepth")
+SDK_UNIT = "/option/Depth_Units/value"
+CLOCK_ERROR_S = 10.0
+"""Where stamps are farther than this from the times of recording, they are from another clock."""
+
+
+class ROSReader:
+    """Reads one RGB-D camera, and the robot, from a recording of ROS."""
+
+    name = "ros"
+    looks_for = "a ROS .bag, .mcap or .db3 file (the RealSense SDK's .db3 too), or the folder of a ROS 2 recording"
+    general = False
+
+    def probe(self, path: Path) -> bool:
+        """Whether it is a recording of ROS, and none of the RealSense SDK."""
+        if path.is_dir():
+            return (path / "metadata.yaml").is_file() and any(f.suffix in (".mcap", ".db3") for f in path.iterdir())
+        return path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
+
+    def read(self, path: Path, given: Metadata) -> Streams:
+        """The streams. Topics are found by type, encoding and name, or as ``topics`` says."""
+        bag = RosBag(path)
+        topics = choose_topics(bag, given)
+        indices = {topic: bag.index(topic) for topic in dict.fromkeys(topics.all())}
+        own_clock = not any(_is_off(i) for i in indices.values())
+        streams = {t: _Topic(bag, t, i, own_clock) for t, i in indices.items()}
+        registered, known = _calibration(bag, topics)
+        notes = [f"topics: {', '.join(topics.all())}"]
+        if not own_clock:
+            notes.append("the messages' stamps are from another clock, so the times of recording are taken")
+        return Streams(
+            streams[topics.color].pictures(),
+            streams[topics.depth].pictures(),
+            state=() if topics.state is None else (streams[topics.state].samples("state"),),
+            action=() if topics.action is None else (streams[topics.action].samples("action"),),
+            known=(*known, _unit(bag, topics.depth)),
+            registered=registered,
+            notes=tuple(notes),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenTopics:
+    """The topics that are read."""
+
+    color: str
+    depth: str
+    state: str | None
+    action: str | None
+    color_info: str | None
+    depth_info: str | None
+
+    def all(self) -> list[str]:
+        """Those with a message per instant."""
+        return [t for t in (self.color, self.depth, self.state, self.action) if t is not None]
+
+
+def choose_topics(bag: RosBag, given: Metadata) -> ChosenTopics:
+    """The topics of one camera and of the robot. Raises :class:`DataError` with the choices where several fit."""
+    types, asked = bag.types(), given.topics
+    for what, topic in asked.model_dump(exclude_none=True).items():
+        if topic not in types:
+            raise DataError(f"{bag.path}: has no topic '{topic}' ({what}); it has {', '.join(sorted(types)) or 'none'}")
+        expected = {"color": IMAGES, "depth": IMAGES, "color_info": (INFO,), "depth_info": (INFO,)}.get(what)
+        if expected is not None and types[topic] not in expected:
+            raise DataError(f"{bag.path}: the topic {topic} ({what}) holds {types[topic]}, expected {expected[0]}")
+        bag.first(topic)
+    images = bag.topics(*IMAGES)
+    first = {topic: bag.first(topic) for topic in images if topic not in (asked.color, asked.depth)}
+    colors = [t for t in first if is_color(first[t]) and "infra" not in t]
+    depths = [t for t in first if is_depth(first[t])]
+    color = asked.color or _one(bag, "color", _prefer(colors, ("color", "rgb")), images)
+    beside = [t for t in depths if _camera(t) == _camera(color)]
+    depth = asked.depth or _one(bag, "depth", _prefer(beside or depths, REGISTERED), images)
+    joints = list(bag.topics(JOINTS))
+    infos = bag.topics(INFO)
+    return ChosenTopics(
+        color,
+        depth,
+        asked.state or (joints[0] if len(joints) == 1 else None),
+        asked.action,
+        asked.color_info or _info_of(color, infos),
+        asked.depth_info or _info_of(depth, infos),
+    )
+
+
+def _prefer(topics: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Those with one of the names, where there are any; of a picture sent twice, the one not compressed."""
+    named = [t for t in topics if any(n in t.lower() for n in names)] or list(topics)
+    return [t for t in named if not (t.rpartition("/")[2] in COMPRESSED and t.rpartition("/")[0] in named)]
+
+
+def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int]) -> str:
+    if len(topics) == 1:
+        return topics[0]
+    where = f"{bag.path.with_suffix('.yaml').name if bag.path.is_file() else FILE_NAME} or the calibration file"
+    if not topics:
+        every = ", ".join(f"{t} ({kind})" for t, kind in sorted(bag.types().items())) or "no topic"
+        raise DataError(f"{bag.path}: no topic is known as {what}; it has {every}; name one in {where}: "
+                        f"'topics: {{{what}: ...}}'")  # fmt: skip
+    some = ", ".join(f"{t} ({counts[t]} pictures)" for t in topics)
+    raise DataError(
+        f"{bag.path}: {len(topics)} topics may be {what}: {some}; choose one in {where}: "
+        f"'topics: {{{what}: {topics[0]}}}'"
+    )
+
+
+def _camera(topic: str) -> str:
+    """The namespace of a camera's topics."""
+    return topic.strip("/").partition("/")[0]
+
+
+def _info_of(topic: str, infos: Mapping[str, int]) -> str | None:
+    """The CameraInfo that is published beside a topic."""
+    last = topic.rpartition("/")[2]
+    beside = (topic.rpartition("/")[0] if last in COMPRESSED else topic).rpartition("/")[0] + "/camera_info"
+    return beside if beside in infos else None
+
+
+def _calibration(bag: RosBag, topics: ChosenTopics) -> tuple[bool, tuple[tuple[str, Metadata], ...]]:
+    """Whether depth is registered, and what CameraInfo and static transforms tell."""
+    frames = [bag.first(t).header.frame_id for t in (topics.color, topics.depth)]
+    registered = any(name in topics.depth for name in REGISTERED) or (frames[0] == frames[1] != "")
+    known: list[tuple[str, dict[str, Any]]] = []
+    if topics.color_info is not None:
+        known.append((topics.color_info, {"intrinsics": camera_of(bag.first(topics.color_info), topics.color)}))
+    if not registered and topics.depth_info is not None:
+        camera = camera_of(bag.first(topics.depth_info), topics.depth)
+        known.append((topics.depth_info, {"depth_intrinsics": camera}))
+    if not registered:
+        static = [t for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")
+                  for _, message in bag.messages(topic) for t in message.transforms]  # fmt: skip
+        T_color_depth = relative_pose(static, *frames)
+        known.append(("/tf_static", {"T_color_depth": None if T_color_depth is None else T_color_depth.tolist()}))
+    return registered, tuple((name, Metadata(**values)) for name, values in known)
+
+
+def _unit(bag: RosBag, depth: str) -> tuple[str, Metadata]:
+    """The unit of depth: what the RealSense SDK's ``.db3`` files say of the device, else the custom of ROS."""
+    for topic in bag.topics("std_msgs/msg/String", "std_msgs/msg/Float32"):
+        if topic.endswith(SDK_UNIT) and _camera(topic) == _camera(depth):
+            return topic, Metadata(depth_unit_m=float(bag.first(topic).data))
+    return "the custom of ROS (REP 118)", Metadata(depth_unit_m=unit_of(bag.first(depth)))
+
+
+def _is_off(index: BagIndex) -> bool:
+    """Whether the stamps of a topic are from another clock than the recording."""
+    off = np.abs(index.measured_s - index.recorded_ns * 1e-9)
+    return bool(np.isfinite(off).any() and np.nanmedian(off) > CLOCK_ERROR_S)
+
+
+@dataclass(frozen=True, slots=True)
+class _Topic:
+    """A topic in the order of time."""
+
+    bag: RosBag
+    name: str
+    index: BagIndex
+    own_clock: bool
+    """Whether the times are those that the messages say."""
+
+    def times(self) -> np.ndarray:
+        """When each message is from, in the order of recording [s]."""
+        recorded = self.index.recorded_ns * 1e-9
+        stamped = self.own_clock and np.isfinite(self.index.measured_s).all()
+        return self.index.measured_s if stamped else recorded
+
+    def pictures(self) -> ImageStream:
+        """Its messages as pictures."""
+        order = np.argsort(self.times(), kind="stable")
+        names = tuple(f"{self.name}[{i}]" for i in order)
+        return ImageStream(names, self.times()[order], partial(_picture, self, order))
+
+    def samples(self, what: str) -> SampleStream:
+        """Its messages as rows of numbers."""
+        rows = [flatten(message) for _, message in self.bag.messages(self.name)]
+        widths = sorted({len(row) for row in rows})
+        if len(widths) != 1 or not widths[0]:
+            raise DataError(
+                f"{self.bag.path}: the messages of {self.name} hold {' or '.join(map(str, widths))} numbers, expected "
+                f"the same number of each; choose another topic, or none, with 'topics: {{{what}: ...}}'"
+            )
+        order = np.argsort(self.times(), kind="stable")
+        return SampleStream(what, self.times()[order], np.array(rows, np.float32)[order])
+
+
+def _picture(topic: _Topic, order: np.ndarray, i: int) -> np.ndarray:
+    return decode_image(topic.bag.message(topic.name, topic.index, int(order[i])))

@@ -1,0 +1,92 @@
+"""The layout of the TUM RGB-D benchmark: ``rgb.txt`` and ``depth.txt`` list pictures with their times."""
+
+from pathlib import Path
+
+import numpy as np
+
+from flowlab.errors import DataError
+from flowlab.recordings.base import Streams
+from flowlab.recordings.image_files import color_stream, depth_stream
+from flowlab.recordings.metadata import Intrinsics, Metadata
+
+ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt")
+DEPTH_FACTOR = 5000
+"""Counts per meter of the benchmark's depth pictures."""
+KINECTS = {
+    "freiburg1": Intrinsics(
+        fx=517.3, fy=516.5, cx=318.6, cy=255.3, width=640, height=480,
+        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    ),
+    "freiburg2": Intrinsics(
+        fx=520.9, fy=521.0, cx=325.1, cy=249.7, width=640, height=480,
+        distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    ),
+    "freiburg3": Intrinsics(fx=535.4, fy=539.2, cx=320.1, cy=247.6, width=640, height=480),
+}  # fmt: skip
+"""The benchmark's own calibration of the three color cameras; their sequences carry these names."""
+
+
+class TUMReader:
+    """Reads sequences of the benchmark, and what is recorded in its layout."""
+
+    name = "tum"
+    looks_for = "a folder with rgb.txt and depth.txt, or associations.txt"
+    general = False
+
+    def probe(self, path: Path) -> bool:
+        """Whether it has the lists."""
+        return _both(path) or _associations(path) is not None
+
+    def read(self, path: Path, given: Metadata) -> Streams:
+        """The streams; both lists where there are, else the pairs of the associations."""
+        if _both(path):
+            color, depth = _entries(path / "rgb.txt", 2), _entries(path / "depth.txt", 2)
+        else:
+            file = _associations(path)
+            if file is None:
+                raise DataError(f"{path}: has neither rgb.txt and depth.txt nor {ASSOCIATIONS[0]}")
+            pairs = _entries(file, 4)
+            color, depth = [p[:2] for p in pairs], sorted(((p[2], p[3]) for p in pairs), key=lambda p: float(p[0]))
+        known = [("the custom of TUM RGB-D", Metadata(depth_unit_m=1 / DEPTH_FACTOR))]
+        camera = next((name for name in KINECTS if name in path.resolve().name), None)
+        if camera is not None:
+            known.append((f"TUM RGB-D's calibration of {camera}", Metadata(intrinsics=KINECTS[camera])))
+        files = [[path / entry[1] for entry in entries] for entries in (color, depth)]
+        times = [np.array([float(entry[0]) for entry in entries]) for entries in (color, depth)]
+        moving = "the camera moves in it (groundtruth.txt), and is taken as fixed"
+        return Streams(
+            color_stream(files[0], times[0]),
+            depth_stream(files[1], times[1]),
+            known=tuple(known),
+            registered=True,
+            notes=(moving,) if (path / "groundtruth.txt").is_file() else (),
+        )
+
+
+def _both(path: Path) -> bool:
+    return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+
+
+def _associations(path: Path) -> Path | None:
+    return next((path / name for name in ASSOCIATIONS if (path / name).is_file()), None)
+
+
+def _entries(file: Path, width: int) -> list[tuple[str, ...]]:
+    """Lines of a list, in the order of the time they begin with."""
+    found = []
+    try:
+        lines = file.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{file}: cannot be read ({error})") from error
+    for number, line in enumerate(lines, 1):
+        parts = tuple(line.split())
+        if not parts or parts[0].startswith("#"):
+            continue
+        try:
+            times = [float(parts[i]) for i in range(0, width, 2)]
+        except (ValueError, IndexError):
+            times = []
+        if len(parts) != width or not np.isfinite(times or [np.nan]).all():
+            raise DataError(f"{file}: line {number} is not {' '.join(['time file'] * (width // 2))}: '{line[:60]}'")
+        found.append(parts)
+    return sorted(found, key=lambda p: float(p[0]))

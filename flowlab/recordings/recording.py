@@ -1,0 +1,137 @@
+"""Recordings of real robots as demonstrations: found, and opened."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowlab.errors import DataError, UsageError
+from flowlab.recordings.base import BadImage, Reader, Streams, load_readers, what_is_looked_for
+from flowlab.recordings.description import Description, StreamInfo, describe
+from flowlab.recordings.frame_check import Survey
+from flowlab.recordings.image_files import natural_order
+from flowlab.recordings.imaging import Imaging
+from flowlab.recordings.parsed import ParsedRecording, RecordingSettings, Rows, recognize
+from flowlab.recordings.timing import gaps
+from flowlab.records import Demonstration, Frame
+
+__all__ = [
+    "Description",
+    "Recording",
+    "RecordingSettings",
+    "StreamInfo",
+    "describe",
+    "find_recordings",
+    "open_recording",
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording(Demonstration):
+    """A recording of a real robot. Row t is a color picture, with the depth picture nearest in time.
+
+    ``extras`` tells where everything comes from: see ``docs/recordings.md``.
+    """
+
+    path: Path
+    streams: Streams
+    imaging: Imaging
+    survey: Survey
+
+    def frame(self, t: int) -> Frame:
+        """Decode the pictures of row t: depth float32 [m] seen from the color camera, and color."""
+        try:
+            rgb = self.streams.color.read(int(self.survey.color[t]))
+            counts = self.streams.depth.read(int(self.survey.depth[t]))
+        except BadImage as error:
+            raise DataError(f"{self.path}: row {t} could be read when it was opened, and now it {error}") from error
+        return Frame(self.imaging.depth(counts), self.camera, rgb=self.imaging.color(rgb))
+
+
+def find_recordings(paths: Sequence[Path]) -> list[Path]:
+    """Every recording at or below the given files and folders, in natural order, each once.
+
+    Raises :class:`UsageError` that says what was looked for where a path has none.
+    """
+    readers = load_readers()
+    found: dict[Path, None] = {}
+    for path in map(Path, paths):
+        if not path.exists():
+            raise UsageError(f"{path}: there is no such file or folder")
+        below = list(_below(path, readers))
+        if not below:
+            raise UsageError(f"{path}: no recording at or below it; looked for {what_is_looked_for(readers)}")
+        found.update(dict.fromkeys(below))
+    return list(found)
+
+
+def _below(path: Path, readers: tuple[Reader, ...]) -> Iterator[Path]:
+    if any(r.probe(path) for r in readers):
+        yield path
+    elif path.is_dir():
+        try:
+            inside = [p for p in path.iterdir() if not p.name.startswith(".") and not p.is_symlink()]
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be looked into ({error.strerror})") from error
+        for p in sorted(inside, key=lambda p: natural_order(p.name)):
+            yield from _below(p, readers)
+
+
+def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: int) -> Recording:
+    """A recording as a demonstration; every picture is decoded once to find the bad ones, and none is kept.
+
+    Where actions were not recorded, ``action[t]`` is ``state[t + 1]`` (the last row repeats its own state);
+    where state was not either, both are (T, 0). ``success`` holds on the last row only. Raises
+    :class:`DataError` with one sentence where it cannot be opened.
+    """
+    source = recognize(Path(path), settings)
+    imaging = source.imaging(settings)
+    source.check_bad_frames(settings)
+    rows = source.rows()
+    success = np.zeros(len(rows.clock_s), bool)
+    success[-1] = source.metadata.success
+    recording = Recording(
+        task=task,
+        seed=seed,
+        camera=imaging.camera,
+        time_s=rows.clock_s - rows.clock_s[0],
+        state=rows.state,
+        action=rows.action,
+        success=success,
+        extras=_extras(source, imaging, rows),
+        path=source.path,
+        streams=source.streams,
+        imaging=imaging,
+        survey=source.survey,
+    )
+    if imaging.registration is not None and not recording.frame(0).depth.any():
+        raise DataError(
+            f"{path}: with this T_color_depth no depth reading lies in the color picture; it must map coordinates "
+            f"of the depth camera to the color camera, in meters; correct it in {source.write_to}"
+        )
+    return recording
+
+
+def _extras(source: ParsedRecording, imaging: Imaging, rows: Rows) -> dict[str, Any]:
+    """Where a recording comes from, as JSON values."""
+    seen, streams = source.survey, source.streams
+    depth = "registered to color by flowlab" if imaging.registration is not None else "registered to color"
+    if imaging.registration is None and streams.registered is None:
+        depth = "taken as registered to color: same size, nothing said"
+    return {
+        "source": source.path.name if source.path.is_absolute() else source.path.as_posix(),
+        "reader": source.reader.name,
+        "frames": {"color": len(streams.color), "depth": len(streams.depth), "looked_at": seen.looked_at},
+        "bad_frames": [[b.name, b.reason] for b in seen.bad],
+        "gaps_s": [list(gap) for gap in gaps(rows.clock_s - rows.clock_s[0])],
+        "max_sync_error_s": {k: float(off.max()) for k, off in seen.sync_s.items() if len(off)},
+        "depth": depth,
+        "depth_unit_m": imaging.depth_unit_m,
+        "shrunk_by": imaging.factor,
+        "origin": dict(sorted(source.origin.items())),
+        "world": "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame",
+        "action": rows.action_is,
+        "notes": list(streams.notes),
+    }

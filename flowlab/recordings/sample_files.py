@@ -1,0 +1,101 @@
+"""Files of numbers: times, and rows of robot state or actions."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from flowlab.errors import DataError
+from flowlab.recordings.base import SampleStream
+
+_TIME_COLUMNS = ("time", "time_s", "t", "timestamp", "timestamps")
+
+
+def load_times(path: Path) -> Float64[np.ndarray, "N"]:
+    """Times [s] of a file, one a line or as a numpy array; they must rise."""
+    time_s = _load(path)[1]
+    if time_s.shape[1] != 1:
+        raise DataError(f"{path}: has {time_s.shape[1]} numbers a line, expected one time in seconds")
+    return check_times(path, time_s[:, 0])
+
+
+def check_times(path: Path, time_s: np.ndarray) -> Float64[np.ndarray, "N"]:
+    """The same times, where they can be seconds and never fall."""
+    step = np.diff(time_s)
+    if not np.isfinite(time_s).all() or (step < 0).any():
+        at = int(np.argmax(~(np.append(0, step) >= 0)))
+        raise DataError(f"{path}: the times must rise, and entry {at + 1} ({time_s[at]}) does not")
+    if len(step) and np.median(step) > 10:
+        raise DataError(
+            f"{path}: the times must be in seconds; with a median of {np.median(step):g} between two they look like "
+            "milli-, micro- or nanoseconds"
+        )
+    return time_s.astype(np.float64)
+
+
+def load_samples(
+    path: Path, name: str, times: Path | None, color_time_s: Float64[np.ndarray, "F"], write_to: str
+) -> SampleStream:
+    """Rows of numbers: with times of their own (a file, or a first column ``time``), else one per color picture."""
+    header, values = _load(path)
+    own = None
+    if header and header[0].lower() in _TIME_COLUMNS:
+        own, values = check_times(path, values[:, 0]), values[:, 1:]
+    if times is not None:
+        own = load_times(times)
+    where = color_time_s if own is None else own
+    if len(where) != len(values):
+        of = "times" if own is not None else "color pictures"
+        raise DataError(
+            f"{path}: has {len(values)} rows for {len(where)} {of}; give every row its time [s] in a file named "
+            f"in {write_to}, as in '{name}_times: {name}_times.txt'"
+        )
+    if not np.isfinite(values).all():
+        row = int(np.argmax(~np.isfinite(values).all(1)))
+        raise DataError(f"{path}: row {row + 1} holds a value that is not finite")
+    return SampleStream(name, where, values.astype(np.float32))
+
+
+def _load(path: Path) -> tuple[list[str], np.ndarray]:
+    """Names of columns (none where the file has none), and rows (N, D) float64."""
+    try:
+        if path.suffix.lower() == ".npy":
+            values = np.asarray(np.load(path), np.float64)
+            return [], _table(path, values)
+        return _parse(path, path.read_text())
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, EOFError, TypeError) as error:
+        raise DataError(f"{path}: is no file of numbers ({error}); expected .npy, or .csv / .txt") from error
+
+
+def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1)]
+    rows = [(n, re.split(r"[,;\s]+", line.strip(",; "))) for n, line in lines if line and not line.startswith("#")]
+    header: list[str] = []
+    if rows and not _is_number(rows[0][1][0]):
+        header = rows.pop(0)[1]
+    if not rows:
+        raise DataError(f"{path}: holds no row of numbers")
+    width = len(header) or len(rows[0][1])
+    for n, row in rows:
+        if len(row) != width or not all(map(_is_number, row)):
+            raise DataError(f"{path}: line {n} is not {width} numbers: '{' '.join(row)[:60]}'")
+    return header, np.array([row for _, row in rows], np.float64)
+
+
+def _table(path: Path, values: np.ndarray) -> np.ndarray:
+    if values.ndim == 1:
+        values = values[:, None]
+    if values.ndim != 2 or not len(values):
+        raise DataError(f"{path}: has the shape {values.shape}, expected (rows, numbers)")
+    return values
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,117 @@
+"""Writing a recording as a plain folder, whole or not at all."""
+
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Bool, Float, Float32, Int8, UInt8
+
+from flowlab.errors import DataError
+from flowlab.geometry.camera import Camera
+from flowlab.recordings.metadata import FILE_NAME, Intrinsics
+
+MOST = np.iinfo(np.uint16).max
+
+
+def write_rgbd_recording(
+    folder: Path,
+    *,
+    rgb: Iterable[UInt8[np.ndarray, "H W 3"]],
+    depth: Iterable[Float[np.ndarray, "H W"]],
+    camera: Camera,
+    time_s: Float[np.ndarray, "T"],
+    state: Float[np.ndarray, "T S"] | None = None,
+    action: Float[np.ndarray, "T A"] | None = None,
+    success: bool = True,
+    task: str | None = None,
+    depth_unit_m: float = 0.001,
+    query_px: Float32[np.ndarray, "N 2"] | None = None,
+    tracks_cam: Float32[np.ndarray, "T N 3"] | None = None,
+    visible: Bool[np.ndarray, "T N"] | None = None,
+    role: Int8[np.ndarray, "N"] | None = None,
+) -> None:
+    """Write frames (depth in meters, 0 or not finite where there is no reading) as a recording.
+
+    Depth is rounded to ``depth_unit_m``, so 0.0001 holds 6.5 m at a tenth of a millimeter; a reading too far
+    for 16 bits is an error. True tracks, where given, go into ``ground_truth.npz``. The folder must not exist.
+    """
+    if folder.exists():
+        raise DataError(f"{folder}: exists already; delete it, or write the recording elsewhere")
+    truth = {"query_px": query_px, "tracks_cam": tracks_cam, "visible": visible, "role": role}
+    temporary = folder.with_name(f".tmp-{os.getpid()}+{folder.name}")
+    try:
+        for name in ("color", "depth"):
+            (temporary / name).mkdir(parents=True, exist_ok=True)
+        _write_pictures(folder, temporary, rgb, depth, camera, len(time_s), depth_unit_m)
+        (temporary / "times.txt").write_text("".join(f"{t!r}\n" for t in np.asarray(time_s, float).tolist()))
+        named = {"state": state, "action": action}
+        for name, values in named.items():
+            if values is not None:
+                if len(values) != len(time_s):
+                    raise DataError(f"{folder}: {len(values)} rows of {name} for {len(time_s)} frames")
+                np.save(temporary / f"{name}.npy", np.asarray(values, np.float32))
+        files = [name for name, values in named.items() if values is not None]
+        (temporary / FILE_NAME).write_text(_yaml(camera, files, depth_unit_m, success, task))
+        if query_px is not None:
+            known: dict[str, Any] = {name: values for name, values in truth.items() if values is not None}
+            np.savez_compressed(temporary / "ground_truth.npz", **known)
+        os.rename(temporary, folder)
+    except OSError as error:
+        raise DataError(f"{folder}: the recording cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_pictures(
+    folder: Path,
+    into: Path,
+    rgb: Iterable[np.ndarray],
+    depth: Iterable[np.ndarray],
+    camera: Camera,
+    steps: int,
+    depth_unit_m: float,
+) -> None:
+    size, t = (camera.height, camera.width), -1
+    try:
+        for t, (picture, meters) in enumerate(zip(rgb, depth, strict=True)):
+            if picture.shape != (*size, 3) or meters.shape != size:
+                raise DataError(f"{folder}: frame {t} is {picture.shape} and {meters.shape}, the camera's is {size}")
+            _write_png(into / "color" / f"{t:06d}.png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            _write_png(into / "depth" / f"{t:06d}.png", _counts(folder, t, meters, depth_unit_m))
+    except ValueError as error:
+        raise DataError(f"{folder}: there are not as many depth as color pictures") from error
+    if t + 1 != steps:
+        raise DataError(f"{folder}: {t + 1} frames for {steps} times")
+
+
+def _write_png(path: Path, picture: np.ndarray) -> None:
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())  # imwrite fails without saying why
+
+
+def _counts(folder: Path, t: int, meters: np.ndarray, unit_m: float) -> np.ndarray:
+    counts = np.rint(np.where(np.isfinite(meters) & (meters > 0), meters, 0).astype(np.float64) / unit_m)
+    if counts.max(initial=0) > MOST:
+        raise DataError(
+            f"{folder}: frame {t} reads {meters[np.isfinite(meters)].max():.4g} m, and 16 bits of {unit_m} m hold "
+            f"{MOST * unit_m:.4g} m; use a greater depth_unit_m"
+        )
+    return counts.astype(np.uint16)
+
+
+def _yaml(camera: Camera, files: list[str], depth_unit_m: float, success: bool, task: str | None) -> str:
+    intrinsics = Intrinsics.from_matrix(camera.K, width=camera.width, height=camera.height)
+    lines = [
+        "times: times.txt",
+        f"depth_unit_m: {depth_unit_m!r}",
+        f"intrinsics: {intrinsics.to_yaml()}",
+        f"T_world_cam: {np.asarray(camera.T_world_cam, float).tolist()}",
+        *(f"{name}: {name}.npy" for name in files),
+        f"success: {str(bool(success)).lower()}",
+        *([yaml.safe_dump({"task": task}).strip()] if task is not None else []),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,135 @@
+"""What can be added to flowlab, by name: trackers, readers, stages, policies, exporters, engines, loggers.
+
+A package offers its own under one of the entry-point groups below, as flowlab itself does; a class that no package
+offers is named by its import path, ``module:Class``.
+"""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from flowlab.errors import UsageError, first_line, unknown_name
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Plugin:
+    """One thing that a package offers by name."""
+
+    family: str
+    """``trackers``, say."""
+    name: str
+    place: str
+    """Import path, ``module:Class``."""
+    package: str
+    """Name and version of the package that offers it."""
+
+
+class Registry(Generic[T]):
+    """One family of things that packages can add to."""
+
+    def __init__(self, family: str, kind: str, base: str) -> None:
+        self.family, self.kind = family, kind
+        self.group = f"flowlab.{family}"
+        """Entry-point group in which packages offer their own."""
+        self._base = base
+
+    def plugins(self) -> dict[str, Plugin]:
+        """Everything that is installed, by name; nothing is imported."""
+        return {e.name: Plugin(self.family, e.name, e.value, _package(e)) for e in self._entries()}
+
+    def load(self, name: str, folder: Path | None = None) -> type[T]:
+        """The class of that name, or at that import path ``module:Class``.
+
+        Args:
+            name: An installed name, with hyphens or underscores, or an import path.
+            folder: Where modules of an import path may lie beside what is installed: it is looked at last, and for
+                this import only. Give it only where the user has named the path; never for names read from a file
+                that somebody else may have made.
+
+        Raises:
+            UsageError: The name does not exist, two packages offer it, it cannot be imported, or it is not of this
+                family. The message names what exists.
+        """
+        loaded = self._from_path(name, folder) if ":" in name else self._from_entry(name)
+        base = getattr(importlib.import_module(self._base.partition(":")[0]), self._base.partition(":")[2])
+        if not (isinstance(loaded, type) and _is_a(loaded, base)):
+            raise UsageError(f"{self.kind} '{name}': is not a subclass of {base.__module__}.{base.__qualname__}")
+        return loaded
+
+    def _entries(self) -> list[EntryPoint]:
+        return sorted(entry_points(group=self.group), key=lambda e: e.name)
+
+    def _from_entry(self, name: str) -> Any:
+        found = [e for e in self._entries() if e.name == name.replace("_", "-")]
+        if not found:
+            raise unknown_name(self.kind, name, [e.name for e in self._entries()])
+        if len({e.value for e in found}) > 1:
+            packages = " and ".join(sorted(_package(e) for e in found))
+            raise UsageError(f"{self.kind} '{name}': is offered by {packages}; uninstall one of them")
+        try:
+            return found[0].load()
+        except Exception as error:  # whatever somebody's package does
+            if _package(found[0]).startswith("flowlab "):
+                raise
+            raise UsageError(
+                f"{self.kind} '{name}' of {_package(found[0])}: cannot be imported ({first_line(error)})"
+            ) from error
+
+    def _from_path(self, place: str, folder: Path | None) -> Any:
+        module, _, attribute = place.partition(":")
+        with _looked_at_last(folder):
+            try:
+                return getattr(importlib.import_module(module), attribute)
+            except Exception as error:  # whatever somebody's module does
+                raise UsageError(f"{self.kind} '{place}': cannot be imported ({first_line(error)})") from error
+
+
+TRACKERS: Registry[Any] = Registry("trackers", "tracker", "flowlab.tracking.base:Tracker")
+READERS: Registry[Any] = Registry("readers", "reader", "flowlab.recordings.base:Reader")
+STAGES: Registry[Any] = Registry("stages", "stage", "flowlab.pipeline.stage:Stage")
+POLICIES: Registry[Any] = Registry("policies", "policy", "flowlab.policies.base:PolicyNetwork")
+EXPORTERS: Registry[Any] = Registry("exporters", "exporter", "flowlab.storage.exporters.base:Exporter")
+ENGINES: Registry[Any] = Registry("engines", "engine", "flowlab.engines.base:Engine")
+LOGGERS: Registry[Any] = Registry("loggers", "logger", "flowlab.training.loggers:MetricsLogger")
+REGISTRIES = (TRACKERS, READERS, STAGES, POLICIES, EXPORTERS, ENGINES, LOGGERS)
+
+
+def _is_a(cls: type, base: type) -> bool:
+    """Whether a class is of a family; where that is told by a protocol, whether it has what the protocol asks for."""
+    if getattr(base, "_is_protocol", False):
+        return all(hasattr(cls, name) for name in _members(base))
+    return issubclass(cls, base)
+
+
+def _members(protocol: type) -> list[str]:
+    names = {*protocol.__dict__, *getattr(protocol, "__annotations__", ())}
+    return sorted(n for n in names if not n.startswith("_"))
+
+
+def _package(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"
+
+
+@contextmanager
+def _looked_at_last(folder: Path | None) -> Iterator[None]:
+    """A folder at the end of the module search path."""
+    if folder is None:
+        yield
+        return
+    place = str(folder.resolve())
+    sys.path.append(place)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if place in sys.path:
+            sys.path.reverse()
+            sys.path.remove(place)  # the one appended
+            sys.path.reverse()

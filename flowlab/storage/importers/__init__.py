@@ -1,0 +1,1 @@
+"""Other tools' stores, read as demonstrations."""

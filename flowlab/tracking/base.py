@@ -1,0 +1,71 @@
+"""What a tracker is: settings, and a session per clip that follows points through part of it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from jaxtyping import Float32
+from pydantic import ValidationError
+
+from flowlab.config import Settings
+from flowlab.errors import UsageError, unknown_name
+from flowlab.records import Clip, Tracks2D
+
+GROUP = "flowlab.trackers"
+"""Entry-point group in which a package offers trackers of its own."""
+
+
+class Session(Protocol):
+    """One clip, opened by a tracker: whatever is made once per frame is made here, once."""
+
+    def track(self, queries_txy: Float32[np.ndarray, "M 3"], start: int, stop: int) -> Tracks2D:
+        """Follow points through frames ``start`` to ``stop - 1``; row k of the result is frame ``start + k``.
+
+        A query is (t, x, y): its frame, ``start <= t < stop``, and its pixel there, integer pixel centers.
+        At its own frame a point is where it was asked for, and visible; before it, it is held there and
+        not visible.
+        """
+        ...
+
+
+class Tracker(Settings, ABC):
+    """Follows points through a clip. The fields of a subclass are its options, settable in recipes."""
+
+    name: ClassVar[str]
+    license: ClassVar[str]
+    """Of its code and weights, in a few words; stored with everything it labeled."""
+    chunked: ClassVar[bool] = True
+    """Whether a long clip is given in overlapping chunks; else whole."""
+
+    @abstractmethod
+    def open(self, clip: Clip) -> Session:
+        """Get ready to track points of a clip."""
+
+    def describe(self) -> dict[str, Any]:
+        """Where labels of this tracker come from, as JSON values; stored in every episode."""
+        return {"tracker": self.name, "license": self.license, "options": self.model_dump(mode="json")}
+
+
+def known_trackers() -> dict[str, str]:
+    """The import path of every installed tracker, by name."""
+    return {e.name: e.value for e in entry_points(group=GROUP)}
+
+
+def make_tracker(name: str, options: Mapping[str, Any] | None = None) -> Tracker:
+    """A tracker by name, with options. Raises :class:`UsageError` for names and options that do not exist."""
+    found = [e for e in entry_points(group=GROUP) if e.name == name]
+    if not found:
+        raise unknown_name("tracker", name, known_trackers())
+    cls = found[0].load()
+    try:
+        tracker = cls.model_validate(dict(options or {}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            raise UsageError(f"tracker '{name}': {unknown_name('option', option, cls.model_fields)}") from error
+        raise UsageError(f"tracker '{name}': {option}: {first['msg']} (found {first['input']!r})") from error
+    assert isinstance(tracker, Tracker)
+    return tracker

@@ -1,0 +1,130 @@
+"""The ``bodies`` tracker: queries carried by the motions of a fit."""
+
+from dataclasses import fields
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float32
+from pydantic import Field
+
+from flowlab.records import Clip, Tracks2D
+from flowlab.tracking.base import Tracker
+from flowlab.tracking.chunking import ChunkSettings, follow
+from flowlab.tracking.trackers.lucas_kanade import LucasKanade
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
+from flowlab.tracking.trackers.rigid_bodies.fit import fit
+from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
+
+_LEAST_FRAMES = 3
+"""A shorter clip shows no motion to fit."""
+
+
+class RigidBodies(Tracker):
+    """Rigid multi-body RGB-D tracking: a few motions, fitted to the whole clip, carry every point.
+
+    A point that no motion explains, or that has no depth where it is asked for, is followed by
+    :class:`~flowlab.tracking.trackers.lucas_kanade.LucasKanade` in chunks instead. Source: the method is flowlab's own;
+    its parts are Kabsch (1976), RANSAC over trajectories, point-to-plane and photometric Gauss-Newton.
+    """
+
+    name: ClassVar[str] = "rigid-bodies"
+    license: ClassVar[str] = "flowlab, Apache-2.0; no weights"
+    chunked: ClassVar[bool] = False
+
+    max_depth: float = Field(default=4.0, gt=0)
+    """Depth beyond this [m] counts as missing."""
+    unexplained: float = Field(default=0.9, gt=0)
+    """Mean cost above which a motion does not explain a point."""
+    seed: int = 0
+    """Of the random choices; the same seed gives the same tracks."""
+
+    def open(self, clip: Clip) -> "RigidBodiesSession":
+        """Get ready to track points of a clip; the fit is made when it is known from which frame on."""
+        return RigidBodiesSession(clip, self)
+
+
+class RigidBodiesSession:
+    """A clip to fit motions to."""
+
+    def __init__(self, clip: Clip, options: RigidBodies) -> None:
+        self._clip = clip
+        self._options = options
+
+    def track(self, queries_txy: Float32[np.ndarray, "M 3"], start: int, stop: int) -> Tracks2D:
+        """See :class:`~flowlab.tracking.base.Session`; one fit is made for each frame that has queries.
+
+        ``disagreement`` is how far apart the motions that explain a point almost as well would put it.
+        """
+        tracks = _blank(stop - start, queries_txy[:, 1:])
+        frame = queries_txy[:, 0].astype(int)
+        for first in np.unique(frame):
+            mine = np.flatnonzero(frame == first)
+            _put(tracks, mine, self._from(first, stop, queries_txy[mine, 1:]), np.s_[first - start :])
+        return tracks
+
+    def _from(self, first: int, stop: int, xy: np.ndarray) -> Tracks2D:
+        """Follow points (M, 2) of frame ``first`` to the frame before ``stop``."""
+        clip = Clip(self._clip.rgb[first:stop], self._clip.depth[first:stop], self._clip.camera)
+        z = depth_at(clip.depth[0], xy)
+        deep = np.flatnonzero((z > 0) & (z < self._options.max_depth))
+        if len(clip) < _LEAST_FRAMES or len(deep) == 0:
+            return _followed(clip, xy)
+        pictures = extract_features(clip, self._options.max_depth)
+        carried = propagate(fit(pictures, self._options.seed), pictures.to_own(xy[deep]), z[deep])
+        explained = deep[carried.cost < self._options.unexplained]
+        tracks = _followed(clip, xy, np.setdiff1d(np.arange(len(xy)), explained))
+        _put(tracks, explained, _modeled(pictures, carried, carried.cost < self._options.unexplained))
+        # The first frame is the question, not an answer.
+        tracks.xy[0], tracks.visible[0] = xy, True
+        return tracks
+
+
+def depth_at(depth: Float32[np.ndarray, "H W"], xy: np.ndarray) -> Float32[np.ndarray, "M"]:
+    """The reading [m] at the pixel nearest to each point (M, 2); 0 where there is none."""
+    column, row = np.rint(xy).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
+    return np.where(inside, depth[np.where(inside, row, 0), np.where(inside, column, 0)], np.float32(0))
+
+
+def _followed(clip: Clip, xy: np.ndarray, of: np.ndarray | slice = slice(None)) -> Tracks2D:
+    """Tracks of all points, of which those of ``of`` are followed in the picture and the rest are left blank."""
+    tracks = follow(clip, xy[of], LucasKanade(), ChunkSettings())
+    whole = _blank(len(clip), xy)
+    _put(whole, np.arange(len(xy))[of], tracks)
+    return whole
+
+
+def _blank(frames: int, xy: np.ndarray) -> Tracks2D:
+    """Points (M, 2) held where they are, unseen, with all that a track may have."""
+    shape = (frames, len(xy))
+    held = np.broadcast_to(xy.astype(np.float32), (*shape, 2)).copy()
+    zero, minus = np.zeros(shape, np.float32), np.full(shape, -1, np.float32)
+    return Tracks2D(held, np.zeros(shape, bool), zero, minus, minus.copy(), zero.copy(), minus.copy())
+
+
+def _put(tracks: Tracks2D, columns: np.ndarray, part: Tracks2D, rows: slice = slice(None)) -> None:
+    """Fill in the tracks of some points; what ``part`` does not tell stays."""
+    for field in fields(Tracks2D):
+        values = getattr(part, field.name)
+        if values is not None:
+            getattr(tracks, field.name)[rows, columns] = values
+
+
+def _modeled(pictures: ClipFeatures, carried: PropagatedTracks, of: np.ndarray) -> Tracks2D:
+    """Tracks of the points ``of`` as their motions carry them."""
+    xyz, seen = carried.xyz_cam[:, of], carried.visible[:, of]
+    z = xyz[..., 2]
+    ahead = z > 0.05
+    # A point that the motion takes behind the camera is nowhere in the picture: it is left at its border.
+    size = pictures.size_of_clip
+    xy = np.clip(pictures.to_clip(pictures.project(xyz)), -size, 2 * size)
+    cost = np.broadcast_to(carried.cost[of], z.shape)
+    focal = pictures.K[0, 0] * pictures.factor
+    return Tracks2D(
+        xy.astype(np.float32),
+        seen & ahead,
+        (1 - cost).clip(0, 1).astype(np.float32),
+        disagreement=(carried.spread[:, of] * focal / np.maximum(z, 0.05)).astype(np.float32),
+        depth=np.where(ahead, z, 0).astype(np.float32),
+        residual=carried.residual[:, of],
+    )

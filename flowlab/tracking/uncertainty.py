@@ -1,0 +1,74 @@
+"""The stated error of every tracked position, from what is known when it is made."""
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from flowlab.records import Clip, PositionSource, Tracks2D
+from flowlab.tracking.lifting import Lifted
+
+EVIDENCE = ("1", "depth", "moved", "disagreement", "forward-backward", "doubt", "hidden", "no depth", "hidden for")
+"""What the error is told from, see :func:`evidence`."""
+
+WEIGHTS = {
+    PositionSource.MEASURED: (-7.084, 2.000, 0.905, 0.025, 0.000, 0.460, 0.000, 0.000, 0.000),
+    PositionSource.MODEL: (-6.958, 2.000, 0.230, 0.258, 0.000, 1.786, 0.150, 0.948, 0.160),
+    PositionSource.FILLED: (-5.659, 2.000, 0.446, 0.060, 0.094, 0.742, 0.000, 0.000, 0.402),
+}
+"""Log of the error [m] per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py``."""
+_LEAST_M, _MOST_M = 0.0005, 1.0
+
+
+def stated_error(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float32[np.ndarray, "T M"]:
+    """The error [m] that 68 % of such positions stay below, by a regression calibrated on simulation.
+
+    The point at the first frame is the query itself: its error is the sensor's, at most what any other row states.
+    """
+    log_error = np.zeros(tracks.visible.shape)
+    values = evidence(clip, tracks, lifted)
+    for source, weights in WEIGHTS.items():
+        mine = lifted.source == source
+        log_error[mine] = values[mine] @ weights
+    return np.exp(log_error).clip(_LEAST_M, _MOST_M).astype(np.float32)
+
+
+def evidence(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float64[np.ndarray, "T M E"]:
+    """What tells the error of every position: logs of how deep it is, how far it has moved, how far apart other
+    estimates put it, and how far it lands when followed back; doubt of the tracker in it (0 to 1); whether it is
+    hidden, or without depth; and the log of for how many frames it has been hidden."""
+    T_world_cam = clip.camera.T_world_cam
+    xyz_cam = (lifted.xyz_world - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+    z = np.maximum(xyz_cam[..., 2], 0.05)
+    meters_per_px = z / clip.camera.K[0, 0]
+    moved = np.linalg.norm(lifted.xyz_world - lifted.xyz_world[:1], axis=-1)
+    columns = (
+        np.ones_like(z),
+        np.log(z),
+        _log_mm(moved),
+        _log_mm(_known(tracks.disagreement, z) * meters_per_px),
+        _log_mm(_known(tracks.forward_backward, z) * meters_per_px),
+        1 - tracks.confidence
+        if tracks.residual is None
+        else np.where(tracks.residual < 0, 1 - tracks.confidence, tracks.residual),
+        ~lifted.visible,
+        ~lifted.depth_valid,
+        np.log1p(_frames_hidden(lifted.visible)),
+    )
+    return np.stack([np.asarray(c, float) for c in columns], -1)
+
+
+def _log_mm(meters: np.ndarray) -> np.ndarray:
+    """Log of a length in mm, of which the first is free."""
+    return np.log1p(1000 * meters)
+
+
+def _known(values: np.ndarray | None, like: np.ndarray) -> np.ndarray:
+    """The values, 0 where they are not known."""
+    return np.zeros_like(like) if values is None else np.maximum(values, 0)
+
+
+def _frames_hidden(visible: np.ndarray) -> np.ndarray:
+    """For how many frames (T, M) each point has been out of sight."""
+    count = np.zeros(visible.shape)
+    for t in range(1, len(visible)):
+        count[t] = (count[t - 1] + 1) * ~visible[t]
+    return count

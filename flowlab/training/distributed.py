@@ -1,0 +1,129 @@
+"""One process, or several under ``torchrun`` that share every batch."""
+
+import ctypes
+import os
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext, suppress
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from flowlab.errors import UsageError
+from flowlab.policies.base import PolicyNetwork
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+"""Of ``malloc.h``."""
+
+
+class ProcessGroup:
+    """This process among those that train together, and the device it computes on."""
+
+    def __init__(self, device: str, threads: int, precision: str) -> None:
+        self.rank, self.count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        kind, _, number = device.partition(":")
+        if kind not in ("cpu", "cuda") or not (number or "0").isdecimal():
+            raise UsageError(f"--device {device}: there is no such device; use cpu, cuda or cuda:1")
+        if kind == "cuda" and int(number or "0") >= torch.cuda.device_count():
+            found = "no such GPU" if torch.cuda.is_available() else "no GPU"
+            raise UsageError(f"--device {device}: PyTorch sees {found} here; use --device cpu")
+        if device == "cuda":
+            device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
+        self.device = torch.device(device)
+        if precision == "auto":
+            precision = "bf16" if has_bf16(self.device) else "fp32"
+        if precision == "bf16" and not has_bf16(self.device):
+            raise UsageError(f"--precision bf16: {self.device} has no units for it, and would be slower; use fp32")
+        self.precision = precision
+        torch.set_num_threads(threads)
+        _keep_freed_memory()
+        if self.count > 1 and not distributed.is_initialized():
+            distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+
+    @property
+    def description(self) -> str:
+        """Device, processes, threads and precision, for people."""
+        threads = f", {torch.get_num_threads()} threads" if torch.get_num_threads() > 1 else ""
+        processes = f"{self.count} processes on " if self.count > 1 else ""
+        return f"{processes}{self.device}{threads}, {self.precision}"
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the process that writes and reports."""
+        return self.rank == 0
+
+    def part(self, windows: int) -> slice:
+        """This process's part of a batch of so many windows."""
+        if windows % self.count:
+            raise UsageError(f"batch.windows is {windows}, which {self.count} processes cannot share evenly")
+        size = windows // self.count
+        return slice(self.rank * size, (self.rank + 1) * size)
+
+    def wrap(self, policy: PolicyNetwork) -> nn.Module:
+        """The policy as it is called for its losses: with several processes, gradients become those of all parts."""
+        if self.count == 1:
+            return policy
+        ids = [self.device.index] if self.device.type == "cuda" else None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # from PyTorch 2.13 on, it is called forward_sync_buffers
+            return DistributedDataParallel(policy, device_ids=ids, broadcast_buffers=False)
+
+    def autocast(self) -> AbstractContextManager[object]:
+        """In which the losses are computed: matrix products in the precision asked for."""
+        return torch.autocast(self.device.type, torch.bfloat16) if self.precision == "bf16" else nullcontext()
+
+    def mean(self, values: dict[str, Tensor]) -> dict[str, float]:
+        """Means over all processes, as numbers."""
+        together = torch.stack([v.float() for v in values.values()])
+        if self.count > 1:
+            distributed.all_reduce(together)
+        return dict(zip(values, (together / self.count).tolist(), strict=True))
+
+    def agree(self, yes: bool) -> bool:
+        """Whether any process says yes; all get the same answer."""
+        if self.count == 1:
+            return yes
+        votes = torch.tensor(int(yes), device=self.device)
+        distributed.all_reduce(votes)
+        return bool(votes)
+
+    def tell(self, number: int) -> int:
+        """The first process's number, in all of them."""
+        if self.count == 1:
+            return number
+        told = torch.tensor(number, device=self.device)
+        distributed.broadcast(told, 0)
+        return int(told)
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.count > 1:
+            distributed.barrier()
+
+    def close(self) -> None:
+        """Part ways."""
+        if self.count > 1:
+            distributed.destroy_process_group()
+
+
+def has_bf16(device: torch.device) -> bool:
+    """Whether a device multiplies matrices faster in bf16: two to four times, where it can at all."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch has none
+    return bool(tell().get("avx512_bf16"))
+
+
+def _keep_freed_memory() -> None:
+    """Have glibc keep what is freed: else it hands every large array back and gets it anew, page by page, in each step.
+
+    A tenth of a training step's time. Elsewhere than on glibc nothing happens.
+    """
+    with suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, 32 << 20)  # the most it takes
+        mallopt(_M_TRIM_THRESHOLD, 1 << 30)

@@ -1,0 +1,172 @@
+"""The training loop."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from flowlab.data.batches import BatchBuilder, WindowSampler, index_windows
+from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.errors import DataError, FlowlabError
+from flowlab.nets.diffusion import NoiseSampler
+from flowlab.policies.base import PolicyNetwork
+from flowlab.policies.checkpoint import RunConfig, save_resume, save_weights, writing_run
+from flowlab.training.distributed import ProcessGroup
+from flowlab.training.metrics import MetricsFile, RunningMeans
+from flowlab.training.optimizer import EMA, Optimizers
+from flowlab.training.validation import validate
+
+_STEPS_PER_LINE = 50
+"""Training steps behind one line of metrics."""
+_SECONDS_BETWEEN_SAVES = 300.0
+"""At least so often, what resuming needs is kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingProgress:
+    """How far a run is."""
+
+    step: int
+    steps: int
+    samples_per_s: float
+    loss: float
+    validation: dict[str, float] | None
+    """The newest errors on held-out demonstrations."""
+
+
+class DivergedError(FlowlabError):
+    """The loss is no longer a number."""
+
+
+class Trainer:
+    """Trains one policy on one corpus, in one or several processes."""
+
+    def __init__(
+        self, folder: Path, run: RunConfig, policy: PolicyNetwork, buffer: ReplayBuffer, processes: ProcessGroup
+    ) -> None:
+        settings = policy.spec.settings
+        self.folder, self.run, self.policy, self.processes = folder, run, policy.to(processes.device), processes
+        self.settings = settings
+        self.average = EMA(policy, settings.optimizer)
+        self.optimizers = Optimizers(policy, settings.optimizer, run.steps)
+        self._network = processes.wrap(policy)
+        self._builder = BatchBuilder(buffer, policy.spec.channels, settings, policy.spec.tasks)
+        windows = index_windows(buffer, list(run.train), settings.n_action_steps)
+        self._sampler = WindowSampler(windows, settings.batch.windows, settings.batch.segment, settings.run.seed)
+        self._looked_at = index_windows(buffer, list(run.held_out), settings.n_action_steps) if run.held_out else None
+        self._means = RunningMeans()
+        self.step = 0
+
+    def train_step(self) -> dict[str, float]:
+        """One step: the losses, averaged over all processes.
+
+        Raises :class:`DivergedError`, before the weights change, where they are not finite.
+        """
+        seed = np.random.SeedSequence([self.settings.run.seed, self.step])
+        batch = self._builder.build(self._sampler.windows(self.step), np.random.default_rng(seed))
+        windows = len(batch.observed)
+        part = self.processes.part(windows)
+        generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+        draws = NoiseSampler(generator, self.processes.device, part)
+        with self.processes.autocast():
+            losses = self._network(batch.part(part).to(self.processes.device), draws, windows)
+        values = {"loss": losses.total, "action_loss": losses.action}
+        if losses.motion is not None:
+            values["motion_loss"] = losses.motion
+        numbers = self.processes.mean({k: v.detach() for k, v in values.items()})
+        if not all(np.isfinite(v) for v in numbers.values()):
+            raise self._diverged(f"the loss is {numbers['loss']}")
+        losses.total.backward()
+        self.optimizers.update(self.step)
+        self.average.update(self.policy, self.step)
+        self.step += 1
+        return numbers
+
+    def fit(
+        self,
+        metrics: MetricsFile | None,
+        report: Callable[[TrainingProgress], None],
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train to the end of the run; False where ``should_stop`` ended it earlier, to be resumed."""
+        needs_frame = _evenly(self.run.steps, self.settings.run.validations) if self._looked_at is not None else set()
+        keeps = _evenly(self.run.steps, self.settings.run.checkpoints)
+        last = None
+        began, last_save, done_before = time.monotonic(), time.monotonic(), self.step
+        while self.step < self.run.steps:
+            self._means.add(self.train_step())
+            at_line = self.step % _STEPS_PER_LINE == 0 or self.step == self.run.steps
+            if at_line:
+                rate = (self.step - done_before) * self.settings.batch.windows / (time.monotonic() - began)
+                averages = self._means.take()
+                learning_rate = self.optimizers.learning_rate(self.step - 1)
+                self._note(metrics, "train", averages | {"lr": learning_rate, "samples_per_s": rate})
+            if self.step in needs_frame:
+                last = self.validate()
+                self._note(metrics, "validation", last)
+            if at_line:
+                report(TrainingProgress(self.step, self.run.steps, rate, averages["loss"], last))
+            stop = self.processes.agree(should_stop())
+            if self.step in keeps:
+                self.keep(self.step)
+            if stop or self.processes.agree(at_line and time.monotonic() - last_save > _SECONDS_BETWEEN_SAVES):
+                self.keep()
+                last_save = time.monotonic()
+            if stop and self.step < self.run.steps:
+                return False
+        return True
+
+    def validate(self) -> dict[str, float]:
+        """Errors of the averaged weights on held-out demonstrations."""
+        assert self._looked_at is not None
+        return validate(self.average.policy, self._builder, self._looked_at, self.processes.device)
+
+    def _note(self, metrics: MetricsFile | None, kind: str, values: dict[str, float]) -> None:
+        if metrics is not None:
+            with writing_run(self.folder):
+                metrics.write(kind, self.step, values)
+
+    def keep(self, checkpoint: int | None = None) -> None:
+        """Keep what resuming needs, and the weights as a checkpoint.
+
+        Raises :class:`DivergedError` where weights are not finite, before anything is written.
+        """
+        if not all(bool(p.isfinite().all()) for p in self.policy.parameters()):
+            raise self._diverged("a weight is no longer finite")
+        if not self.processes.is_first:
+            return
+        if checkpoint is not None:
+            save_weights(self.folder, self.average.policy, checkpoint)
+        groups = {
+            "policy": self.policy.state_dict(),
+            "average": self.average.policy.state_dict(),
+            "optimizer": self.optimizers.state(),
+            "means": {k: torch.tensor(v, dtype=torch.float64) for k, v in self._means.state().items()},
+        }
+        save_resume(self.folder, self.step, groups)
+
+    def load_state(self, step: int, groups: dict[str, dict[str, torch.Tensor]]) -> None:
+        """Go on from what :func:`~flowlab.policies.checkpoint.read_resume` gives."""
+        try:
+            self.policy.load_state_dict(groups["policy"])
+            self.average.policy.load_state_dict(groups["average"])
+            if step:
+                self.optimizers.load(groups["optimizer"])
+        except (KeyError, RuntimeError) as error:
+            raise DataError(f"{self.folder}: its resume file does not fit its policy.json; start anew") from error
+        self._means.load({name: float(value) for name, value in groups.get("means", {}).items()})
+        self.step = step
+
+    def _diverged(self, what: str) -> DivergedError:
+        return DivergedError(
+            f"{self.folder}: {what} at step {self.step}; the last checkpoint is whole. Lower optimizer.learning_rate "
+            "and start anew, or look at the data with 'flowlab validate'"
+        )
+
+
+def _evenly(steps: int, times: int) -> set[int]:
+    """The steps after which something happens so many times, the last time at the end."""
+    return {round(steps * k / times) for k in range(1, times + 1)}

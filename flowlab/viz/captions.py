@@ -1,0 +1,107 @@
+"""What captions and info panels say of an episode."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from flowlab.records import Episode, PositionSource, Role
+from flowlab.viz.colors import SIGMA_LIMIT
+
+MOVING_M = 0.01
+"""A query point moves if it ever gets this far from where it was first [m], beyond what its stated errors allow."""
+
+
+def caption(episode: Episode, shown: int) -> str:
+    """An episode in one line; ``shown`` is how many of the moving points have their trails drawn."""
+    T, moves = len(episode), int(moving(episode).sum())
+    facts = [
+        f"{episode.task}, seed {episode.seed}",
+        f"{T} steps, {episode.time_s[-1]:.2f} s",
+        f"{int(episode.point_count[0])} cloud points",
+        f"{episode.queries.count} query points",
+        f"{moves} of them move" + (f" ({shown} shown)" if shown < moves else ""),
+        _outcome(episode),
+    ]
+    return "   ·   ".join(facts)
+
+
+def _outcome(episode: Episode) -> str:
+    if episode.tracks.quality is not None:  # of a recording, which nobody needs to tell whether it succeeded
+        return sigma_summary(episode)
+    return f"solved at step {int(episode.success.argmax())}" if episode.success.any() else "not solved"
+
+
+def sigma_summary(episode: Episode, t: int | slice = slice(None)) -> str:
+    """Median and 90th percentile of the stated errors, of a step or of all; needs ``tracks.quality``."""
+    assert episode.tracks.quality is not None
+    median, p90 = np.percentile(1000 * episode.tracks.quality.sigma[t, : episode.queries.count], [50, 90])
+    return f"σ median {median:.0f} mm, p90 {p90:.0f} mm"
+
+
+def tracker_name(episode: Episode) -> str:
+    """Which tracker labeled the episode; empty for exact tracks."""
+    return "" if episode.tracks.quality is None else str(_about_tracker(episode).get("tracker", "not known"))
+
+
+def _about_tracker(episode: Episode) -> Mapping[str, Any]:
+    """What :meth:`flowlab.tracking.base.Tracker.describe` said, as far as it was kept."""
+    about = episode.extras.get("tracker")
+    return about if isinstance(about, Mapping) else {}
+
+
+def describe(episode: Episode) -> str:
+    """The facts of an episode as a Markdown table."""
+    roles, counts = np.unique(episode.query_role[: episode.queries.count], return_counts=True)
+    camera, solved = episode.camera, int(episode.success.sum())
+    rows = {
+        "task": episode.task,
+        "seed": episode.seed,
+        "frames": f"{len(episode)} ({episode.time_s[-1]:.2f} s)",
+        "success": f"{solved} steps, first at {int(episode.success.argmax())}" if solved else "never",
+        "cloud points": " to ".join(map(str, np.unique([episode.point_count.min(), episode.point_count.max()]))),
+        "query points": ", ".join(f"{n} {role_name(r)}" for r, n in zip(roles, counts, strict=True)),
+        "visible": f"{episode.tracks.visible[:, : episode.queries.count].mean():.0%} of all track points",
+        "camera": f"{camera.width} x {camera.height} px, f = {camera.K[0, 0]:.1f} px",
+        "camera position": f"{np.round(camera.T_world_cam[:3, 3], 3).tolist()} m",
+    }
+    if "source" in episode.extras:
+        rows["recording"] = episode.extras["source"]
+    rows |= _describe_quality(episode)
+    lines = [f"| {key} | {value} |" for key, value in rows.items()]
+    return "\n".join([lines[0], "|---|---|", *lines[1:]])
+
+
+def _describe_quality(episode: Episode) -> dict[str, str]:
+    """What is known of the error of estimated tracks; nothing for exact ones."""
+    quality, count = episode.tracks.quality, episode.queries.count
+    if quality is None:
+        return {}
+    source, shares = np.unique(quality.source[:, :count], return_counts=True)
+    shares = shares / shares.sum()
+    return {
+        "tracker": tracker_name(episode),
+        "its license": str(_about_tracker(episode).get("license", "not known")),
+        "positions": ", ".join(
+            f"{n:.0%} {PositionSource(s).name.lower()}" for s, n in zip(source, shares, strict=True)
+        ),
+        "stated error": sigma_summary(episode),
+        "color of tracks": f"stated error σ, from 0 (turquoise) over {500 * SIGMA_LIMIT:.0f} mm (yellow) "
+        f"to {1000 * SIGMA_LIMIT:.0f} mm and more (red); dark where out of sight",
+    }
+
+
+def moving(episode: Episode) -> Bool[np.ndarray, "M"]:
+    """Which distinct query points ever get :data:`MOVING_M` away from where they were first; of estimated
+    tracks, beyond twice their stated errors."""
+    quality, count = episode.tracks.quality, episode.queries.count
+    xyz_world = episode.tracks.xyz_world[:, :count]
+    doubt = 0.0 if quality is None else 2 * np.hypot(quality.sigma[:, :count], quality.sigma[0, :count])
+    far: np.ndarray = (np.linalg.norm(xyz_world - xyz_world[0], axis=-1) - doubt).max(0) > MOVING_M
+    return far
+
+
+def role_name(role: int) -> str:
+    """What people call a role; -1 is the role of a point whose owner is not known."""
+    return Role(role).name.lower() if role >= 0 else "unknown"

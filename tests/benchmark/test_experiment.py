@@ -1,0 +1,362 @@
+"""``flowlab bench`` as a user runs it: every unit is done once, however often the experiment is ended and begun."""
+
+import csv
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from synthetic import call_cli, files_below
+from trained_runs import NETWORK, header_of, lines_of, make_run, options, policy_of, weights_of
+
+from flowlab.benchmark.experiment import load_experiment, plan_units
+from flowlab.cli import main
+from flowlab.storage.dataset import Dataset
+
+Capture = pytest.CaptureFixture[str]
+TASK = "drawer-open"
+SHORT = (
+    *NETWORK, "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=1",
+    "diffusion.inference_steps=2",
+)  # fmt: skip
+UNITS = [f"{TASK}-dp3", f"{TASK}-fdp", f"{TASK}-fdp-m4"]
+REPORT = ["report.html", "report.json", "report.csv", "episodes.csv"]
+TINY: dict[str, Any] = {
+    "name": "tiny",
+    "tasks": [TASK],
+    "policies": ["dp3", "fdp"],
+    "demonstrations": 2,
+    "recipe": "metaworld",
+    "query_points": 8,
+    "profile": "fast",
+    "minutes": 30,
+    "set": [*SHORT],
+    "seeds": [0],
+    "episodes": 2,
+    "curve_episodes": 1,
+    "variants": [{"name": "m4", "tasks": [TASK, "push"], "set": ["motion.points=4"]}],
+    "device": "cpu",
+}
+"""Three policies, each of two steps; `set` comes after what `minutes` says."""
+
+
+def write_recipe(folder: Path, **changes: Any) -> Path:
+    path = folder / "tiny.yaml"
+    path.write_text(yaml.safe_dump({k: v for k, v in {**TINY, **changes}.items() if v is not None}))
+    return path
+
+
+def kill_after_the_first_unit(out: Path, recipe: Path) -> None:
+    """Start an experiment, and kill all its processes once a unit is done."""
+    command: list[str | Path] = [sys.executable, "-m", "flowlab", "bench", "--out", out, "--recipe", recipe]
+    command += ["--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
+    try:
+        end = time.monotonic() + 300
+        while not any(out.glob("units/*.json")):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < end, "waited in vain"
+            time.sleep(0.005)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recipe(tmp_path_factory.mktemp("recipe"))
+
+
+@pytest.fixture(scope="module")
+def experiment(recipe: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An experiment that was killed after its first unit, and went on. Copy it before changing it."""
+    out = tmp_path_factory.mktemp("experiment") / "tiny"
+    kill_after_the_first_unit(out, recipe)
+    done = files_below(out / "units")
+    assert 1 <= len(done) < 3
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        main("bench", "--out", str(out), "--recipe", str(recipe), "--workers", "2")
+    after = files_below(out / "units")
+    assert {name: after[name] for name in done} == done, "what was done is left alone"
+    return out
+
+
+def unit(out: Path, name: str) -> dict[str, Any]:
+    return json.loads((out / f"units/{name}.json").read_text())
+
+
+def bench(capsys: Capture, out: Path, recipe: Path, *more: str) -> tuple[int, str, str]:
+    return call_cli(capsys, "bench", "--out", out, "--recipe", recipe, *more)
+
+
+def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: Path) -> None:
+    assert sorted(p.name for p in experiment.iterdir() if p.is_dir() and p.name != "figures") == [
+        "data", "runs", "units",
+    ]  # fmt: skip
+    assert sorted(p.stem for p in (experiment / "units").iterdir()) == UNITS
+    for name in UNITS:
+        found, run = unit(experiment, name), experiment / "runs" / name
+        policy, _, variant = name.removeprefix(f"{TASK}-").partition("-")
+        assert (found["name"], found["tasks"]) == (name, [TASK])
+        assert found["label"] == name.removeprefix(f"{TASK}-")
+        about = found["training"]
+        assert (about["policy"], about["steps"], about["demonstrations"]) == (policy, 2, 2)
+        assert about["device"] == "cpu"
+        assert about["settings"] == policy_of(run)["policy"]["settings"]
+        assert about["settings"]["motion"]["points"] == (4 if variant else 8)
+        assert (about["settings"]["run"]["steps"], about["settings"]["run"]["minutes"]) == (2, None)
+        tensors = header_of(run / "checkpoints/step-00000002.safetensors")
+        shapes = [tensor["shape"] for key, tensor in tensors.items() if key != "__metadata__"]
+        assert about["weights"] == sum(math.prod(shape) for shape in shapes)
+        assert about["cpu_s"] == pytest.approx(lines_of(run)[-1]["cpu_s"], abs=0.051)
+        assert about["held_out"]["action_l1"] > 0
+        tried = {
+            e["step"]: [(o["seed"], o["episode"], o["scene_seed"]) for o in e["outcomes"]] for e in found["evaluations"]
+        }
+        assert tried == {1: [(0, 0, 1_000_000)], 2: [(0, 0, 1_000_000), (0, 1, 1_000_001)]}
+        for e in found["evaluations"]:
+            assert e["n_action_steps"] == 8
+            log = run / f"evaluation/step-{e['step']:08d}-execute-8/episodes.jsonl"
+            lines = [json.loads(line) for line in log.read_text().splitlines()]
+            assert sorted(lines, key=lambda x: x["episode"]) == e["outcomes"]
+
+
+def test_all_policies_of_a_task_share_a_dataset(experiment: Path) -> None:
+    assert [p.name for p in (experiment / "data").iterdir()] == [TASK]
+    data = Dataset(experiment / "data" / TASK)
+    assert [(ref.task, ref.seed) for ref in data.refs] == [(TASK, k) for k in range(3)]
+    assert data.manifest.settings["queries"]["points"] == 8
+    for name in UNITS:
+        run = json.loads((experiment / f"runs/{name}/run.json").read_text())
+        assert (run["train"], run["held_out"]) == ([0, 1], [2])
+
+
+def test_a_unit_is_trained_as_by_hand(experiment: Path, tmp_path: Path) -> None:
+    changes = options("data.demonstrations=2", "data.held_out=1", *SHORT, "motion.points=4")
+    data = shutil.copytree(experiment / "data" / TASK, tmp_path / "d")
+    run = make_run(data, "--policy", "fdp", "--out", tmp_path / "run", *changes, "--device", "cpu")
+    mine, theirs = weights_of(run, 2), weights_of(experiment / f"runs/{UNITS[2]}", 2)
+    assert mine.keys() == theirs.keys()
+    for name in mine:
+        np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-3, atol=1e-5)
+
+
+def test_a_report_tells_of_all_of_them(experiment: Path) -> None:
+    assert {p.name for p in experiment.iterdir() if p.is_file()} == set(REPORT)
+    page = (experiment / "report.html").read_text()
+    assert all(label in page for label in ("dp3", "fdp", "fdp-m4"))
+    with (experiment / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = sorted((r["result"], int(r["episode"]), r["scene_seed"]) for r in rows if r["step"] == "2")
+    assert found == [(name, k, str(1_000_000 + k)) for name in UNITS for k in range(2)]
+
+
+def test_again_there_is_nothing_to_do_even_without_runs_and_data(
+    experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    shutil.rmtree(out / "runs")
+    shutil.rmtree(out / "data")
+    before = files_below(out / "units")
+    code, said, err = bench(capsys, out, recipe)
+    assert code == 0, err
+    assert err.splitlines()[-1] == "3 of 3 policies done"
+    assert said.splitlines()[-1].startswith(str(out / "report.html"))
+    assert files_below(out / "units") == before
+    assert not (out / "runs").exists()
+    assert not (out / "data").exists()
+    for name in REPORT[1:]:
+        assert (out / name).read_bytes() == (experiment / name).read_bytes()
+    code, said, err = bench(capsys, out, recipe, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(said) == [unit(out, name) for name in UNITS]
+    assert files_below(out / "units") == before
+
+
+def test_a_unit_that_is_lost_is_done_again_alone(
+    experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """From the run and the episodes that are there: it comes out as it was, and the rest is not touched."""
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    (out / f"units/{UNITS[1]}.json").unlink()
+    before = files_below(out)
+    code, _, err = bench(capsys, out, recipe, "--workers", "1")
+    assert code == 0, err
+    assert unit(out, UNITS[1]) == unit(experiment, UNITS[1])
+    after = files_below(out)
+    assert {name: after[name] for name in before if name.startswith("units")} == {
+        name: was for name, was in before.items() if name.startswith("units")
+    }
+    for name, (content, _) in after.items():
+        if name.startswith(("runs", "data")):
+            assert content == before[name][0], name
+
+
+def test_what_was_made_with_other_settings_is_refused_with_the_difference(
+    experiment: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    changed = write_recipe(tmp_path, set=[*SHORT, "optimizer.learning_rate=0.5"])
+    before = files_below(out)
+    code, said, err = bench(capsys, out, changed)
+    assert (code, said) == (3, "")
+    first, second = err.splitlines()
+    place = out / f"units/{UNITS[0]}.json"
+    assert first == (
+        f"flowlab: {place}: was made with other settings; choose another --out, or delete it to make it anew:"
+    )
+    assert second == "  settings.optimizer.learning_rate: it has 0.002, the recipe has 0.5"
+    assert files_below(out) == before
+    place.unlink()  # then the run is in the way
+    code, said, err = bench(capsys, out, changed, "--policies", "dp3", "--variants", "none")
+    assert (code, said) == (3, "")
+    assert f"flowlab: {out / 'runs' / UNITS[0]}: was made with other settings" in err
+    assert "the recipe has 0.5" in err
+    assert not place.exists()
+
+
+@pytest.mark.parametrize("asked", [("--episodes", "3"), ("--seeds", "5")])
+def test_other_episodes_than_were_tried_are_not_passed_over(
+    asked: tuple[str, str], experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """They are refused, or else tried."""
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    code, said, _ = bench(capsys, out, recipe, *asked, "--json")
+    assert code in (0, 3)
+    wanted = [(0, 0), (0, 1), (0, 2)] if asked[0] == "--episodes" else [(5, 0), (5, 1)]
+    for result in json.loads(said) if code == 0 else []:
+        assert [(o["seed"], o["episode"]) for o in result["evaluations"][-1]["outcomes"]] == wanted
+
+
+def test_a_damaged_unit_is_said(experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture) -> None:
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    place = out / f"units/{UNITS[2]}.json"
+    for text, sentence in (("{", "not valid JSON"), ('{"name": "x"}', "label: Field required")):
+        place.write_text(text)
+        code, said, err = bench(capsys, out, recipe)
+        assert (code, said) == (3, "")
+        assert err.startswith(f"flowlab: {place}: {sentence}")
+        assert err.count("\n") == 1
+
+
+def test_a_dry_run_says_what_would_be_done(recipe: Path, tmp_path: Path, capsys: Capture) -> None:
+    code, said, err = bench(capsys, tmp_path / "out", recipe, "--dry-run", "--workers", "2")
+    assert (code, err) == (0, "")
+    assert said.splitlines() == [
+        *UNITS, "3 policies, 30 minutes of training each: 1.5 hours of one core, 0.8 on 2",
+    ]  # fmt: skip
+    more = ("--task", "push", "--task", TASK, "--policies", "mba, fdp", "--variants", "m4", "--budget", "1.5h")
+    code, said, err = bench(capsys, tmp_path / "out", recipe, *more, "--dry-run", "--workers", "1")
+    assert (code, err) == (0, "")
+    *units, last = said.splitlines()
+    own = {f"{task}-{policy}" for task in ("push", TASK) for policy in ("mba", "fdp")}
+    assert set(units[:4]) == own
+    assert set(units[4:]) == {f"{TASK}-fdp-m4", "push-fdp-m4"}
+    assert last == "6 policies, 90 minutes of training each: 9.0 hours of one core, 9.0 on 1"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_recipe_that_comes_with_flowlab_is_the_papers() -> None:
+    """Hard tasks and those of the ablation for three policies; variants of 3D FDP on the tasks they name."""
+    recipe = load_experiment("paper")
+    units = plan_units(recipe)
+    assert len(units) == len({u.name for u in units})
+    tasks = {u.task for u in units}
+    hard = {"assembly", "hand-insert", "pick-out-of-hole", "pick-place", "push", "push-back"}
+    assert tasks == hard | {"basketball", "box-close", "hammer", "handle-press", "handle-pull"}
+    labels = {task: {u.label for u in units if u.task == task} for task in tasks}
+    assert all({"fdp", "dp3", "mba"} <= found for found in labels.values())
+    assert {task for task in tasks if "fdp-m50" in labels[task]} == hard
+    for u in units:
+        assert u.settings.run.minutes == recipe.minutes
+        assert u.settings.motion.points <= recipe.query_points
+        assert u.dataset == f"data/{u.task}" + {"fdp-object": "-object", "fdp-stratified": "-stratified"}.get(
+            u.label, ""
+        )
+        assert {"fdp-m50": 50, "fdp-m200": 200}.get(u.label, 100) == u.settings.motion.points
+    assert [u.name for u in plan_units(load_experiment("paper", tasks=("push",), policies=("dp3",), variants=()))] == [
+        "push-dp3"
+    ]
+
+
+WRONG: dict[str, tuple[list[str], str]] = {
+    "recipe": (["--recipe", "papr"], "no experiment is called 'papr'; did you mean paper?"),
+    "recipe file": (["--recipe", "no.yaml"], "no.yaml: cannot read the experiment (No such file or directory)"),
+    "policy": (["--policies", "fdp,fpd"], "no policy is called 'fpd'; did you mean fdp?"),
+    "task": (["--task", "drawer-opn"], "no task is called 'drawer-opn'; did you mean drawer-open"),
+    "group": (["--group", "hardest"], "hardest"),
+    "variant": (["--variants", "m5"], "no variant of this recipe is called 'm5'; there are: m4"),
+    "budget": (["--budget", "x"], "--budget x: must be a time, as in 10m, 90s or 1.5h"),
+    "budget without unit": (["--budget", "10"], "--budget 10: must be a time"),
+    "no time": (["--budget", "0m"], "--budget 0m: must be a time"),
+    "time without end": (["--budget", "infh"], "--budget infh: must be a time"),
+    "time that is none": (["--budget", "nanm"], "--budget nanm: must be a time"),
+    "seeds": (["--seeds", "a"], "--seeds a: must be whole numbers"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_said_in_one_sentence(
+    case: str, recipe: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong, sentence = WRONG[case]
+    monkeypatch.chdir(tmp_path)
+    code, said, err = bench(capsys, tmp_path / "out", recipe, *wrong)
+    assert (code, said) == (2, "")
+    assert err.startswith("flowlab: ")
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+BROKEN: dict[str, tuple[dict[str, Any], str]] = {
+    "key": ({"episods": 3}, "episods: no setting is called 'episods'; did you mean episodes"),
+    "key that is missing": ({"minutes": None}, "minutes: Field required"),
+    "value": ({"minutes": "soon"}, "minutes: "),
+    "no time": ({"minutes": 0}, "minutes: "),
+    "setting": ({"set": ["motoin.points=3"]}, "no setting is called 'motoin'; did you mean motion?"),
+    "profile": ({"profile": "fsat"}, "no profile is called 'fsat'; did you mean fast?"),
+    "policy of a variant": (
+        {"variants": [{"name": "a", "tasks": [TASK], "set": [], "policy": "fpd"}]}, "no policy is called 'fpd'",
+    ),
+    "recipe of the datasets": ({"recipe": "metawrld"}, "no recipe is called 'metawrld'; did you mean metaworld"),
+    "seed without layouts": ({"seeds": [4000]}, "seed 4000: evaluation seeds are from 0 to 3999"),
+    "variants of one name": (
+        {"variants": [{"name": "a", "tasks": [TASK], "set": [f"motion.points={k}"]} for k in (2, 3)]}, "fdp-a",
+    ),
+}  # fmt: skip
+BROKEN["too many query points"] = ({"query_points": 1}, "query points, and the datasets get 1; raise query_points")
+BROKEN["no policies"] = ({"policies": []}, "policies: ")
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_recipe_that_is_wrong_is_refused_before_anything_is_done(case: str, tmp_path: Path, capsys: Capture) -> None:
+    changes, sentence = BROKEN[case]
+    path = write_recipe(tmp_path, **changes)
+    more = ("--dry-run",) if case != "recipe of the datasets" else ()
+    code, said, err = bench(capsys, tmp_path / "out", path, *more)
+    assert (code, said) == (2, "")
+    assert err.startswith("flowlab: ")
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(("text", "sentence"), [("[", "not valid YAML"), ("- push", "is a mapping with the keys name")])
+def test_a_file_that_is_no_recipe(text: str, sentence: str, tmp_path: Path, capsys: Capture) -> None:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(text)
+    code, said, err = bench(capsys, tmp_path / "out", path)
+    assert (code, said) == (2, "")
+    assert err.startswith(f"flowlab: experiment {path}: {sentence}")

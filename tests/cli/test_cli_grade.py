@@ -1,0 +1,163 @@
+"""``flowlab grade`` as a user gives it: what it writes and prints, and what it says of mistakes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from flowlab.cli.grade import grade
+from flowlab.errors import DataError, FlowlabError, MissingLibraryError, UsageError
+from flowlab.geometry.camera import Camera
+from flowlab.recordings.writing import write_rgbd_recording
+
+STEPS, WIDTH, HEIGHT = 12, 96, 72
+CAMERA = Camera.from_fovy(WIDTH, HEIGHT, 50.0, np.eye(4))
+SMALL = ("--size", "96x72", "--tracker", "lucas-kanade")
+
+
+def write_slide(folder: Path, *, truth: bool = True) -> None:
+    """A textured plane 1 m before the camera slides 1 px a step to the right; its points are known."""
+    rng = np.random.default_rng(0)
+    texture = np.kron(rng.integers(40, 215, (HEIGHT // 4, WIDTH // 2, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+    rgb = np.stack([texture[:, STEPS - t :][:, :WIDTH] for t in range(STEPS)])
+    depth = np.ones((STEPS, HEIGHT, WIDTH), np.float32)
+    query = rng.integers(15, 55, (20, 2)).astype(np.float32)
+    uv = query + np.arange(STEPS)[:, None, None] * np.array([1.0, 0])
+    tracks = np.append((uv - CAMERA.K[:2, 2]) / CAMERA.K[0, 0], np.ones((*uv.shape[:2], 1)), -1).astype(np.float32)
+    known: dict[str, Any] = {"query_px": query, "tracks_cam": tracks, "visible": np.ones(uv.shape[:2], bool)}
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    write_rgbd_recording(
+        folder, rgb=rgb, depth=depth, camera=CAMERA, time_s=np.arange(STEPS) / 30, **(known if truth else {})
+    )
+
+
+def run(*arguments: str | Path) -> None:
+    grade.main([str(a) for a in arguments], standalone_mode=False)
+
+
+@pytest.fixture(scope="module")
+def slides(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two recordings, one below another folder, and one whose truth is not known."""
+    folder = tmp_path_factory.mktemp("slides")
+    write_slide(folder / "one")
+    write_slide(folder / "deeper" / "two")
+    write_slide(folder / "unknown", truth=False)
+    return folder
+
+
+def test_recordings_below_a_folder_are_graded(slides: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(slides, slides / "one", "--tracker", "lucas-kanade", "--out", tmp_path)
+    printed = capsys.readouterr()
+    values = json.loads((tmp_path / "grade.json").read_text())
+    (tracker,) = values["trackers"]
+    assert tracker["tracker"] == "lucas-kanade"
+    assert [r["recording"] for r in tracker["recordings"]] == ["two", "one"]
+    assert [r["frames"] for r in tracker["recordings"]] == [STEPS] * 2
+    assert tracker["mean"]["all"]["median_mm"] < 2, "a textured plane that slides is easy"
+    assert tracker["mean"]["tapvid"]["apd"] > 0.9
+    assert "moving" not in tracker["mean"], "nobody said what the points lie on"
+    assert values["simulated"] is None
+    assert imread(tmp_path / "grade.png").shape[0] > 300
+    for word in ("lucas-kanade", "visible", "two", "one", "3D-AJ", "grade.png"):
+        assert word in printed.out
+    assert max(map(len, printed.out.splitlines()[:-1])) <= 80
+
+
+def test_json_is_all_that_is_printed(slides: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(slides / "one", "--tracker", "lucas-kanade", "--out", tmp_path, "--json", "--chunk", "8", "--stride", "4")
+    printed = capsys.readouterr()
+    values = json.loads(printed.out)
+    assert values == json.loads((tmp_path / "grade.json").read_text())
+    assert (values["chunks"]["length"], values["chunks"]["stride"]) == (8, 4)
+    assert printed.err == ""
+
+
+def test_trackers_side_by_side(slides: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    both = ("--tracker", "lucas-kanade", "--tracker", "rigid-bodies")
+    run(slides / "one", *both, "--out", tmp_path, "--set", "lucas-kanade.window=9")
+    trackers = json.loads((tmp_path / "grade.json").read_text())["trackers"]
+    assert [t["tracker"] for t in trackers] == ["lucas-kanade", "rigid-bodies"]
+    assert trackers[0]["options"]["window"] == 9
+    assert "rigid-bodies" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_tasks_are_simulated_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        run(*SMALL, "--tasks", "reach", "--sensor", "clean", "--out", tmp_path)
+    except MissingLibraryError as error:
+        pytest.skip(str(error))
+    assert [p.name for p in (tmp_path / "recordings").iterdir()] == ["reach-0"]
+    assert "reach-0: recorded" in capsys.readouterr().err
+    values = json.loads((tmp_path / "grade.json").read_text())
+    assert values["simulated"]["sensor"]["axial_noise"] == 0
+    assert values["trackers"][0]["mean"]["moving"]["n"] > 100
+    run(*SMALL, "--tasks", "reach", "--sensor", "clean", "--out", tmp_path)
+    assert "there already" in capsys.readouterr().err
+    run(*SMALL, "--tasks", "reach", "--seed", "1", "--out", tmp_path)
+    assert (tmp_path / "recordings" / "reach-1").is_dir()
+    assert "not graded, because" in capsys.readouterr().out, "noise costs queries"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "expected"),
+    [
+        ((), UsageError, "nothing to grade; give folders .* or --tasks hammer,door-open"),
+        ((*SMALL, "--tasks", "reach, hamer"), UsageError, "did you mean hammer"),
+        (("--tasks", "hammer", "--tracker", "bodys"), UsageError, "no tracker is called 'bodys'; did you mean bodies"),
+        (("--tasks", "hammer", "--size", "320"), UsageError, "--size 320: must look like 320x240"),
+        (("--tasks", "hammer", "--chunk", "4"), UsageError, r"--chunk, --stride: stride \(8\) must be below length"),
+        (("--tasks", "hammer", "--set", "window"), UsageError, "--set window: must look like KEY=VALUE"),
+        ((*SMALL, "--tasks", "hammer", "--set", "size=3"), UsageError, "no option is called 'size'"),
+        (("--tasks", "hammer", "--set", "body.x=3"), UsageError, "no tracker of this run is called 'body'"),
+        (("--tasks", "hammer", "--set", "x=["), UsageError, "not valid YAML"),
+        ((*SMALL, "--tasks", "hammer", "--weights", "w.pt"), UsageError, "no option is called 'weights'"),
+        ((*SMALL, "no/such/folder"), DataError, "no/such/folder: there is no such folder"),
+    ],
+)
+def test_mistakes_are_told(
+    arguments: tuple[str, ...], error: type[FlowlabError], expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=expected):
+        run(*arguments, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists(), "nothing was begun"
+
+
+def test_a_recording_without_truth(slides: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"unknown: no recording at or below it has a ground_truth.npz.*--tasks"):
+        run(slides / "unknown", "--tracker", "lucas-kanade", "--out", tmp_path / "out")
+
+
+def test_a_folder_that_cannot_be_written(slides: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(FlowlabError, match="choose another --out"):
+        run(slides / "one", "--tracker", "lucas-kanade", "--out", tmp_path / "file" / "out")
+
+
+@pytest.mark.parametrize(
+    "settings", [{"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}, {"MUJOCO_GL": "no-such-backend"}]
+)
+def test_without_opengl_it_says_what_to_install(settings: dict[str, str], tmp_path: Path) -> None:
+    command = """if True:
+        import sys
+        from flowlab.cli.grade import grade
+        from flowlab.errors import FlowlabError
+        try:
+            grade.main(sys.argv[1:], standalone_mode=False)
+        except FlowlabError as error:
+            sys.exit(str(error))"""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")}
+    arguments = [*SMALL, "--tasks", "reach", "--out", str(tmp_path)]
+    result = subprocess.run(
+        [sys.executable, "-c", command, *arguments], capture_output=True, text=True, env=inherited | settings
+    )
+    assert result.returncode == 1
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith(("OpenGL cannot be used here", "MuJoCo cannot load OpenGL"))
+    assert "apt-get install libegl1" in last

@@ -1,0 +1,425 @@
+"""A shard gives back what was put into it, bit for bit, or says which file is damaged."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numcodecs import Zstd
+from synthetic import CAMERA, assert_same, make_episode, with_quality
+
+from flowlab.errors import DataError
+from flowlab.files import remove_leftovers
+from flowlab.records import Entity, Episode, Role
+from flowlab.storage.schema import QUALITY
+from flowlab.storage.shard import STEPS_PER_CHUNK, Shard, episode_digest, write_shard
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])}
+ARRAYS = {
+    "data/time", "data/point_cloud", "data/point_count", "data/state", "data/action", "data/success", "data/tracks",
+    "data/visible", "data/object_pose", "meta/seed", "meta/success", "meta/query_owner", "meta/query_role",
+    "meta/query_count", "meta/query_xyz", "meta/association_distance", "meta/episode_ends",
+}  # fmt: skip
+
+
+def any_bits(rng: np.random.Generator, like: np.ndarray) -> np.ndarray:
+    """An array of random bits: NaN, infinity and negative zero included."""
+    return np.frombuffer(rng.bytes(like.nbytes), like.dtype).reshape(like.shape).copy()
+
+
+def scrambled(episode: Episode, seed: int) -> Episode:
+    rng = np.random.default_rng(seed)
+    quality = episode.tracks.quality
+    if quality is not None:
+        measured = ("sigma", "source", "forward_backward", "disagreement", "residual")
+        quality = replace(quality, **{name: any_bits(rng, getattr(quality, name)) for name in measured})
+    return replace(
+        episode,
+        **{
+            name: any_bits(rng, values)
+            for name in ("point_cloud", "point_count", "state", "action", "object_pose", "depth", "rgb")
+            if (values := getattr(episode, name)) is not None
+        },
+        success=rng.random(len(episode)) < 0.5,
+        tracks=replace(episode.tracks, xyz_world=any_bits(rng, episode.tracks.xyz_world), quality=quality),
+    )
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)  # fmt: skip
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 40), min_size=1, max_size=4),
+    points=st.integers(1, 30),
+    queries=st.integers(1, 9),
+    options=st.fixed_dictionaries({name: st.booleans() for name in ("object_pose", "depth", "rgb")}),
+    estimated=st.booleans(),
+    extras=st.dictionaries(st.text(), json_values, max_size=3),
+    seed=st.integers(0, 2**31),
+)
+def test_episodes_come_back_bit_for_bit(
+    tmp_path_factory: pytest.TempPathFactory,
+    lengths: list[int],
+    points: int,
+    queries: int,
+    options: dict[str, bool],
+    estimated: bool,
+    extras: dict[str, Any],
+    seed: int,
+) -> None:
+    path = tmp_path_factory.mktemp("shard") / "unit.zarr"
+    made = [make_episode(seed + k, steps=n, points=points, queries=queries, **options) for k, n in enumerate(lengths)]
+    made = [replace(scrambled(with_quality(e, e.seed) if estimated else e, e.seed), extras=extras) for e in made]
+    write_shard(path, made, "digest")
+    shard = Shard(path)
+    assert len(shard) == len(made)
+    for k, (put, got) in enumerate(zip(made, shard.episodes(), strict=True)):
+        assert_same(put, got)
+        assert_same(put, shard.episode(k))
+        assert episode_digest(put) == episode_digest(got)
+
+
+@pytest.fixture
+def episodes() -> list[Episode]:
+    return [make_episode(0, steps=10), make_episode(1, steps=20)]
+
+
+@pytest.fixture
+def path(tmp_path: Path, episodes: list[Episode]) -> Path:
+    write_shard(tmp_path / "unit.zarr", episodes, "digest")
+    return tmp_path / "unit.zarr"
+
+
+def test_what_lies_on_disk_is_documented_zarr_v3(path: Path) -> None:
+    root = json.loads((path / "zarr.json").read_text())
+    assert (root["zarr_format"], root["node_type"]) == (3, "group")
+    assert root["attributes"]["settings_digest"] == "digest"
+    assert root["attributes"]["camera"] == CAMERA.to_json()
+    found = {str(f.parent.relative_to(path)): json.loads(f.read_text()) for f in path.rglob("zarr.json")}
+    arrays = {name: meta for name, meta in found.items() if meta["node_type"] == "array"}
+    assert arrays.keys() == ARRAYS
+    for name, meta in arrays.items():
+        assert meta["zarr_format"] == 3
+        assert len(meta["dimension_names"]) == len(meta["shape"]), name
+        assert all(meta["dimension_names"]), name
+        assert meta["dimension_names"][0] == ("time" if name.startswith("data/") else "episode")
+        assert meta["attributes"]["unit"], name
+        assert len(meta["attributes"]["meaning"]) > 10, name
+        assert [c["name"] for c in meta["codecs"]] == ["bytes", "zstd", "crc32c"], name
+    assert arrays["data/tracks"]["shape"] == [30, 8, 3]
+    assert arrays["data/tracks"]["attributes"]["unit"] == "m"
+
+
+def crc32c(data: bytes) -> int:
+    """Castagnoli's checksum, by its definition."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
+    return crc ^ 0xFFFFFFFF
+
+
+def test_chunks_decode_by_hand_and_carry_a_right_checksum(path: Path, episodes: list[Episode]) -> None:
+    assert crc32c(b"123456789") == 0xE3069283  # the check value of the standard
+    raw = (path / "data/action/c/0/0").read_bytes()
+    body, checksum = raw[:-4], raw[-4:]
+    assert int.from_bytes(checksum, "little") == crc32c(body)
+    assert Zstd().decode(body) == np.concatenate([e.action for e in episodes]).astype("<f4").tobytes()
+
+
+def test_long_shards_are_cut_into_chunks(tmp_path: Path) -> None:
+    long = make_episode(0, steps=2 * STEPS_PER_CHUNK + 3, points=4, queries=2)
+    write_shard(tmp_path / "long.zarr", [long], "")
+    assert sorted(p.name for p in (tmp_path / "long.zarr/data/tracks/c").iterdir()) == ["0", "1", "2"]
+    meta = json.loads((tmp_path / "long.zarr/data/tracks/zarr.json").read_text())
+    assert meta["chunk_grid"]["configuration"]["chunk_shape"] == [STEPS_PER_CHUNK, 2, 3]
+    second = Zstd().decode((tmp_path / "long.zarr/data/tracks/c/1/0/0").read_bytes()[:-4])
+    assert second == long.tracks.xyz_world[STEPS_PER_CHUNK : 2 * STEPS_PER_CHUNK].tobytes()
+    assert_same(long, Shard(tmp_path / "long.zarr").episode(0))
+
+
+def truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-7])
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+def empty(file: Path) -> None:
+    file.write_bytes(b"")
+
+
+@pytest.mark.parametrize("harm", [truncate, flip, empty, Path.unlink])
+@pytest.mark.parametrize("chunk", ["data/tracks/c/0/0/0", "data/success/c/0", "meta/query_owner/c/0/0"])
+def test_a_damaged_chunk_is_an_error_that_names_the_array(path: Path, chunk: str, harm: Callable[[Path], None]) -> None:
+    harm(path / chunk)
+    array = chunk.partition("/c/")[0]
+    with pytest.raises(DataError, match=rf"{path}/{array}: .*(damaged|missing).*; delete the unit's receipt"):
+        list(Shard(path).episodes())
+    with pytest.raises(DataError, match=f"{path}/{array}: "):
+        Shard(path).episode(1)
+
+
+@pytest.mark.parametrize("array", ["data/tracks", "meta/seed", "meta/episode_ends"])
+def test_a_missing_array_is_an_error_that_names_it(path: Path, array: str) -> None:
+    shutil.rmtree(path / array)
+    with pytest.raises(DataError, match=f"{path}/{array}: the array is missing"):
+        list(Shard(path).episodes())
+
+
+def test_of_the_arrays_of_quality_none_may_be_missing(tmp_path: Path) -> None:
+    write_shard(tmp_path / "unit.zarr", [with_quality(make_episode())], "")
+    shutil.rmtree(tmp_path / "unit.zarr/data/source")
+    with pytest.raises(DataError, match="data/source: the array is missing"):
+        Shard(tmp_path / "unit.zarr").episode(0)
+    for name in QUALITY:
+        shutil.rmtree(tmp_path / "unit.zarr" / name, ignore_errors=True)
+    assert Shard(tmp_path / "unit.zarr").episode(0).tracks.quality is None
+
+
+def test_a_recording_without_a_robot_is_stored_too(tmp_path: Path) -> None:
+    """Neither state nor action: arrays with rows, and nothing in them."""
+    nothing = np.zeros((12, 0), np.float32)
+    watched = replace(make_episode(), state=nothing, action=nothing)
+    write_shard(tmp_path / "unit.zarr", [watched], "")
+    assert_same(watched, Shard(tmp_path / "unit.zarr").episode(0))
+
+
+def test_describing_a_shard_that_lacks_an_array_says_so(path: Path) -> None:
+    shutil.rmtree(path / "meta/episode_ends")
+    with pytest.raises(DataError, match="meta/episode_ends"):
+        Shard(path).describe()
+
+
+@pytest.mark.parametrize("content", ["", "{", '{"zarr_format": 3, "node_type": "group", "attributes": {}}'])
+def test_a_broken_group_is_an_error_that_names_the_shard(path: Path, content: str) -> None:
+    (path / "zarr.json").write_text(content)
+    with pytest.raises(DataError, match=str(path)):
+        len(Shard(path))
+    with pytest.raises(DataError, match=str(path)):
+        list(Shard(path).episodes())
+
+
+def test_values_that_are_all_zero_are_stored_all_the_same(tmp_path: Path) -> None:
+    """Otherwise a lost chunk could pass for one that was never written."""
+    failed = replace(make_episode(0), success=np.zeros(12, bool))
+    write_shard(tmp_path / "unit.zarr", [failed], "")
+    assert (tmp_path / "unit.zarr/data/success/c/0").stat().st_size > 0
+    assert not Shard(tmp_path / "unit.zarr").episode(0).success.any()
+    (tmp_path / "unit.zarr/data/success/c/0").unlink()
+    with pytest.raises(DataError, match="1 of 1 chunks missing"):
+        Shard(tmp_path / "unit.zarr").episode(0)
+
+
+def test_writing_onto_a_shard_replaces_it(path: Path, episodes: list[Episode]) -> None:
+    other = make_episode(5, steps=7, object_pose=False)
+    write_shard(path, [other], "digest")
+    assert [e.seed for e in Shard(path).episodes()] == [5]
+    assert_same(other, Shard(path).episode(0))
+    assert not (path / "data/object_pose").exists()
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+MIXED = {
+    "cameras": lambda e: replace(e, camera=replace(e.camera, K=2 * e.camera.K)),
+    "things": lambda e: replace(e, queries=replace(e.queries, entities=(Entity("x", "x", Role.ROBOT),) * 2)),
+    "arrays": lambda e: replace(e, object_pose=None),
+    "kinds of tracks": with_quality,
+}
+"""Episodes that one shard cannot tell apart: it has one camera, one list of things, one set of arrays."""
+
+
+@pytest.mark.parametrize("what", MIXED)
+def test_episodes_that_do_not_go_together_are_refused(tmp_path: Path, episodes: list[Episode], what: str) -> None:
+    with pytest.raises(DataError, match="one shard"):
+        write_shard(tmp_path / "unit.zarr", [episodes[0], MIXED[what](episodes[1])], "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_digest_of_an_episode_does_not_depend_on_its_shard(tmp_path: Path, episodes: list[Episode]) -> None:
+    for k, group in enumerate([episodes, episodes[1:], episodes[::-1]]):
+        write_shard(tmp_path / f"{k}.zarr", group, str(k))
+    digests = [{e.seed: episode_digest(e) for e in Shard(tmp_path / f"{k}.zarr").episodes()} for k in range(3)]
+    assert digests[0] == digests[2]
+    assert digests[0][1] == digests[1][1] == episode_digest(episodes[1])
+    assert digests[0][0] != digests[0][1]
+
+
+def test_the_digest_changes_with_everything_that_is_stored() -> None:
+    plain = with_quality(make_episode(0, depth=True, rgb=True))
+    q, tr = plain.queries, plain.tracks
+
+    def nudged(a: np.ndarray | None) -> np.ndarray:
+        """The least change: one bit of one element."""
+        assert a is not None
+        b = a.copy()
+        b.reshape(-1).view(np.uint8)[0] ^= 1
+        return b
+
+    columns = ("point_cloud", "point_count", "state", "action", "success", "object_pose", "depth", "rgb")
+    changed = [replace(plain, **{name: nudged(getattr(plain, name))}) for name in columns]
+    changed += [replace(plain, **{name: None}) for name in ("object_pose", "depth", "rgb")]
+    changed += [replace(plain, tracks=replace(tr, **{n: nudged(getattr(tr, n))})) for n in
+                ("xyz_world", "visible", "association_distance")]  # fmt: skip
+    assert tr.quality is not None
+    changed += [
+        replace(plain, tracks=replace(tr, quality=replace(tr.quality, **{f.name: nudged(getattr(tr.quality, f.name))})))
+        for f in fields(tr.quality)
+    ]
+    changed += [replace(plain, tracks=replace(tr, quality=None))]
+    changed += [replace(plain, queries=replace(q, **{n: nudged(getattr(q, n))})) for n in ("xyz_world", "owner")]
+    changed += [
+        replace(plain, queries=replace(q, count=q.count - 1)),
+        replace(plain, task="other"),
+        replace(plain, seed=1),
+        replace(plain, extras={"rand_vec": [0.0]}),
+        replace(plain, camera=replace(plain.camera, width=17)),
+    ]
+    digests = [episode_digest(e) for e in [plain, *changed]]
+    assert len(set(digests)) == len(digests)
+
+
+KILLED = """
+import os, random, signal, sys, time
+from pathlib import Path
+from synthetic import make_episode
+from flowlab.storage.shard import write_shard
+
+folder, rounds, over = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "over"
+rng = random.Random(0)
+old, new = (make_episode(k, steps=300) for k in (1, 2))
+for name in ["../warm", *(range(rounds) if over else ())]:
+    write_shard(folder / f"{name}.zarr", [old], "")
+for k in range(rounds):
+    pid = os.fork()
+    if not pid:
+        write_shard(folder / f"{k}.zarr", [new], "")
+        os._exit(0)
+    while not (begun := any(str(pid) in name for name in os.listdir(folder))):
+        if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            break
+    if begun and k < rounds - 1:  # the last may live
+        if k % 2:  # so that half are hit near the end, where the shard comes to its place
+            while any(not (folder / n / "meta/episode_ends/c/0").exists() for n in os.listdir(folder) if str(pid) in n):
+                pass
+            time.sleep(rng.uniform(0, 0.003))
+        else:
+            time.sleep(rng.uniform(0, 0.008))
+        os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+"""
+
+
+@pytest.mark.parametrize("over", [False, True], ids=["fresh", "over an old shard"])
+def test_a_writer_that_is_killed_leaves_a_whole_shard_or_none(tmp_path: Path, over: bool) -> None:
+    """Killed at random moments of the write, in many rounds."""
+    rounds = 40
+    script, folder = tmp_path / "killed.py", tmp_path / "shards"
+    script.write_text(KILLED)
+    folder.mkdir()
+    command = [sys.executable, script, folder, str(rounds), "over" if over else "fresh"]
+    subprocess.run(command, env=ENVIRONMENT, check=True, timeout=120)
+    old, new = (episode_digest(make_episode(k, steps=300)) for k in (1, 2))
+    shards = [p for k in range(rounds) if (p := folder / f"{k}.zarr").exists()]
+    assert {episode_digest(Shard(p).episode(0)) for p in shards} <= {old, new}
+    assert any(folder.glob(".tmp-*")), "no writer was killed as it wrote: nothing was tested"
+    remove_leftovers(folder)
+    assert set(folder.iterdir()) == set(shards)
+
+
+WRITES_HALF = """
+import socket, sys
+from pathlib import Path
+machine = sys.argv[2] or socket.gethostname()
+socket.gethostname = lambda: machine
+import flowlab.storage.shard as shard
+from synthetic import make_episode
+
+def stop(*_):
+    print(flush=True)
+    sys.stdin.read()
+    shard.os._exit(0)
+
+shard.os.rename = stop
+shard.write_shard(Path(sys.argv[1]) / "unit.zarr", [make_episode()], "")
+"""
+
+
+def leave_half(folder: Path, machine: str = "") -> tuple[Path, subprocess.Popen[str]]:
+    """What a writer has left so far, and the writer, which waits for its input to end."""
+    before = set(folder.iterdir())
+    command = [sys.executable, "-c", WRITES_HALF, folder, machine]
+    writer = subprocess.Popen(command, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert writer.stdout
+    writer.stdout.readline()
+    (left,) = set(folder.iterdir()) - before
+    return left, writer
+
+
+def test_leftovers_of_the_dead_go_and_those_of_the_living_stay(tmp_path: Path) -> None:
+    write_shard(tmp_path / "other.zarr", [make_episode()], "")
+    left, writer = leave_half(tmp_path)
+    remove_leftovers(tmp_path)
+    assert set(tmp_path.iterdir()) == {left, tmp_path / "other.zarr"}
+    writer.communicate()
+    remove_leftovers(tmp_path)
+    assert set(tmp_path.iterdir()) == {tmp_path / "other.zarr"}
+
+
+@pytest.mark.parametrize("suffix", ["-b", "-99999999", "b"])
+def test_leftovers_of_other_machines_stay(tmp_path: Path, suffix: str) -> None:
+    """Machines of a cluster are called node-1 and node-1-2; the latter's work is not for the former to remove."""
+    left, writer = leave_half(tmp_path, socket.gethostname() + suffix)
+    writer.communicate()
+    remove_leftovers(tmp_path)
+    assert list(tmp_path.iterdir()) == [left]
+
+
+WRITES_OFTEN = """
+import sys
+from pathlib import Path
+from synthetic import make_episode
+from flowlab.storage.shard import write_shard
+for _ in range(12):
+    write_shard(Path(sys.argv[1]) / "unit.zarr", [make_episode()], "")
+"""
+
+
+def test_two_jobs_may_write_the_same_shard(tmp_path: Path) -> None:
+    """As happens where both make good the same failed seed."""
+    jobs = [
+        subprocess.Popen([sys.executable, "-c", WRITES_OFTEN, tmp_path], env=ENVIRONMENT, stderr=subprocess.PIPE)
+        for _ in range(3)
+    ]
+    assert [job.communicate()[1].decode()[-500:] for job in jobs] == [""] * 3
+    assert_same(make_episode(), Shard(tmp_path / "unit.zarr").episode(0))
+    assert [p.name for p in tmp_path.iterdir()] == ["unit.zarr"]
+
+
+def test_other_zarr_readers_see_plain_arrays(path: Path, episodes: list[Episode]) -> None:
+    group = zarr.open_group(path, mode="r")
+    tracks, ends = group["data/tracks"], group["meta/episode_ends"]
+    assert isinstance(tracks, zarr.Array)
+    assert isinstance(ends, zarr.Array)
+    assert np.array_equal(ends[...], [10, 30])
+    assert np.array_equal(tracks[10:30], episodes[1].tracks.xyz_world)

@@ -1,0 +1,242 @@
+"""The rigid-body tracker against scenes whose motion is known in closed form."""
+
+from dataclasses import fields
+
+import moving_planes
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from flowlab.geometry.sampling import farthest_points
+from flowlab.records import Clip, PositionSource, Tracks2D
+from flowlab.testing.trackers import check_tracker
+from flowlab.tracking.chunking import ChunkSettings
+from flowlab.tracking.labeling import label_clip
+from flowlab.tracking.lifting import LiftSettings
+from flowlab.tracking.trackers.rigid_bodies import Bodies, _kernels
+from flowlab.tracking.trackers.rigid_bodies.features import extract_features
+from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, best_rigid
+
+FRAMES = 24
+
+
+def two_plates() -> list[moving_planes.Plate]:
+    """One slides to the right and turns; one comes nearer, tilting."""
+    return [
+        moving_planes.wall(1.2, FRAMES),
+        moving_planes.moving(
+            (0.22, 0.26), (-0.2, -0.12, 0.8), np.array([0.008, 0.002, 0]), np.array([0, 0, 0.015]), FRAMES, 1
+        ),
+        moving_planes.moving(
+            (0.24, 0.22), (0.2, 0.15, 0.9), np.array([-0.002, 0, -0.007]), np.array([0, 0.012, 0]), FRAMES, 2
+        ),
+    ]
+
+
+def queries(owner: np.ndarray, of: int, count: int = 20, border: int = 4) -> np.ndarray:
+    """Pixels (M, 2) of frame 0 that show a plate, away from its edges."""
+    inner = np.ones_like(owner, bool)
+    for axis in (0, 1):
+        for shift in (-border, border):
+            inner &= np.roll(owner, shift, axis) == of
+    inner[:border], inner[-border:], inner[:, :border], inner[:, -border:] = False, False, False, False
+    v, u = np.nonzero(inner & (owner == of))
+    xy = np.stack([u, v, np.zeros(len(u))], -1).astype(np.float32)
+    return xy[farthest_points(xy, count), :2]
+
+
+def errors(
+    scene: list[moving_planes.Plate], clip: Clip, owner: np.ndarray, xy: np.ndarray
+) -> tuple[np.ndarray, Tracks2D]:
+    """Distance (T, M) [m] between labels and truth."""
+    tracks, labels = label_clip(clip, xy, Bodies(), ChunkSettings(), LiftSettings())
+    return np.linalg.norm(labels.xyz_world - moving_planes.paths(scene, clip, owner, xy), axis=-1), tracks
+
+
+@pytest.mark.parametrize(("noise", "within"), [(0.0, 0.004), (0.003, 0.006)])
+def test_follows_things_that_move_differently(noise: float, within: float) -> None:
+    scene = two_plates()
+    clip, owner = moving_planes.film(scene, noise=noise)
+    for k, limit in [(0, 0.001 + 3 * noise), (1, within), (2, within)]:
+        error, tracks = errors(scene, clip, owner, queries(owner, k))
+        assert np.median(error, 1)[1:].max() < limit, k
+        assert (error[-1] < 0.02 + 4 * noise).mean() >= 0.9, k
+        assert tracks.visible.mean() > 0.5
+
+
+def test_does_not_drift() -> None:
+    scene = two_plates()
+    clip, owner = moving_planes.film(scene)
+    error, _ = errors(scene, clip, owner, queries(owner, 1))
+    assert np.median(error[-4:]) < np.median(error[4:8]) + 0.002
+
+
+def test_a_hidden_point_is_carried_on_and_said_to_be_hidden() -> None:
+    frames = 30
+    scene = [
+        moving_planes.wall(1.2, frames),
+        moving_planes.moving((0.2, 0.2), (-0.1, 0, 1.0), np.array([0.004, 0, 0]), np.zeros(3), frames, 1),
+        moving_planes.moving((0.16, 0.5), (-0.45, 0, 0.7), np.array([0.024, 0, 0]), np.zeros(3), frames, 2),
+    ]
+    clip, owner = moving_planes.film(scene)
+    xy = queries(owner, 1, count=12)
+    _, labels = label_clip(clip, xy, Bodies(), ChunkSettings(), LiftSettings())
+    truth = moving_planes.paths(scene, clip, owner, xy)
+    uv, z = clip.camera.project(truth)
+    j, i = np.rint(uv).astype(int).transpose(2, 0, 1)
+    shown = clip.depth[np.arange(frames)[:, None], i, j]
+    hidden = shown < z - 0.1
+    assert 0.1 < hidden.mean() < 0.9
+    # Within a pixel of the edge of what hides a point, either answer is right.
+    assert labels.visible[hidden].mean() < 0.15
+    assert labels.visible[~hidden].mean() > 0.9
+    assert labels.quality is not None
+    assert np.isin(labels.quality.source[1:], [PositionSource.MODEL]).all()
+    error = np.linalg.norm(labels.xyz_world - truth, axis=-1)
+    assert np.median(error[hidden]) < 0.006
+    assert np.median(error[-1]) < 0.006
+
+
+def test_a_moving_camera_is_one_body() -> None:
+    velocity, spin = np.array([0.004, -0.002, 0.003]), np.array([0.003, 0.004, 0.002])
+    steps = np.arange(FRAMES)[:, None]
+    R, t = Rotation.from_rotvec(steps * spin).as_matrix(), steps * velocity
+    still = [
+        moving_planes.wall(1.1, FRAMES),
+        moving_planes.moving((0.3, 0.25), (0, 0, 0.8), 0 * velocity, 0 * spin, FRAMES, 1),
+    ]
+    scene = [moving_planes.Plate(p.size, R @ p.R, (R @ p.t[..., None])[..., 0] + t, p.seed) for p in still]
+    clip, owner = moving_planes.film(scene)
+    for k in (0, 1):
+        error, _ = errors(scene, clip, owner, queries(owner, k, border=12))
+        assert np.median(error[-1]) < 0.008, k
+
+
+def test_large_pictures_are_shrunk_and_give_the_same_places() -> None:
+    scene = two_plates()
+    clip, owner = moving_planes.film(scene, width=640, height=480)
+    assert extract_features(clip, 4.0).depth.shape[1:] == (240, 320)
+    error, _ = errors(scene, clip, owner, queries(owner, 1, border=16))
+    assert np.median(error, 1).max() < 0.004
+
+
+def test_own_pixels_and_the_clips_are_inverse_and_mean_the_same_ray() -> None:
+    clip, _ = moving_planes.film(two_plates(), width=960, height=720)
+    pictures = extract_features(Clip(clip.rgb[:2], clip.depth[:2], clip.camera), 4.0)
+    uv = np.array([[100.0, 200.0], [3.5, 7.25]])
+    np.testing.assert_allclose(pictures.to_clip(pictures.to_own(uv)), uv)
+    z = np.array([1.0, 2.0])
+    np.testing.assert_allclose(pictures.unproject(pictures.to_own(uv), z), clip.camera.unproject(uv, z))
+
+
+def test_points_without_depth_are_followed_in_the_picture() -> None:
+    scene = two_plates()
+    clip, owner = moving_planes.film(scene)
+    xy = queries(owner, 1, count=10)
+    hole = clip.depth.copy()
+    hole[0, xy[0, 1].astype(int), xy[0, 0].astype(int)] = 0
+    tracks = Bodies().open(Clip(clip.rgb, hole, clip.camera)).track(np.insert(xy, 0, 0, axis=1), 0, FRAMES)
+    assert tracks.depth is not None
+    assert tracks.forward_backward is not None
+    assert (tracks.depth[:, 0] == 0).all()
+    assert (tracks.depth[1:, 1:] > 0).all()
+    assert (tracks.forward_backward[0:, 0] >= 0).any()
+    uv, _ = clip.camera.project(moving_planes.paths(scene, clip, owner, xy[:1]))
+    assert np.linalg.norm(tracks.xy[-1, 0] - uv[-1, 0]) < 3
+
+
+def test_what_nothing_explains_is_followed_in_the_picture() -> None:
+    clip, owner = moving_planes.film(two_plates())
+    query = np.insert(queries(owner, 1, count=5), 0, 0, axis=1)
+    tracks = Bodies(unexplained=1e-6).open(clip).track(query, 0, FRAMES)
+    assert tracks.depth is not None
+    assert (tracks.depth == 0).all()
+
+
+def test_same_seed_same_tracks() -> None:
+    clip, owner = moving_planes.film(two_plates(), noise=0.003)
+    query = np.insert(np.concatenate([queries(owner, k, 6) for k in range(3)]), 0, 0, axis=1)
+    one, other = (Bodies(seed=3).open(clip).track(query, 0, FRAMES) for _ in range(2))
+    for field in fields(Tracks2D):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_keeps_the_contract_of_trackers() -> None:
+    check_tracker(Bodies)
+
+
+@given(
+    rotation=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+    t=st.lists(st.floats(-1, 1), min_size=3, max_size=3),
+    outliers=st.integers(0, 4),
+    seed=st.integers(0, 99),
+)
+def test_best_rigid_finds_the_motion_despite_outliers(
+    rotation: list[float], t: list[float], outliers: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    a = rng.normal(0, 0.1, (30, 3))
+    R = Rotation.from_rotvec(rotation).as_matrix()
+    b = a @ R.T + t
+    b[:outliers] += rng.normal(0, 0.02, (outliers, 3))
+    R_found, t_found = best_rigid(a, b, np.ones(30), refinements=12)
+    np.testing.assert_allclose(R_found, R, atol=0.02)
+    np.testing.assert_allclose(t_found, t, atol=0.002)
+    assert np.linalg.det(R_found) == pytest.approx(1)
+
+
+def test_best_rigid_agrees_with_scipy() -> None:
+    rng = np.random.default_rng(0)
+    a, b, w = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.uniform(0.1, 1, 20)
+    R, t = best_rigid(a, b, w, refinements=0)
+    mean_a, mean_b = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
+    expected = Rotation.align_vectors(b - mean_b, a - mean_a, weights=w)[0].as_matrix()
+    np.testing.assert_allclose(R, expected, atol=1e-8)
+    np.testing.assert_allclose(t, mean_b - expected @ mean_a, atol=1e-8)
+
+
+def test_a_motion_carries_points() -> None:
+    R = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_matrix()
+    motion = RigidMotion(R, np.array([[0, 0, 0], [1.0, 0, 0]]))
+    np.testing.assert_allclose(motion.carry(np.array([[1.0, 0, 2.0]]))[:, 0], [[1, 0, 2], [1, 1, 2]], atol=1e-12)
+
+
+def test_normals_of_a_tilted_plane() -> None:
+    normal = np.array([0.3, -0.2, -1.0])
+    normal /= np.linalg.norm(normal)
+    K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
+    v, u = np.mgrid[:120, :160]
+    rays = np.stack([(u - 79.5) / 150, (v - 59.5) / 150, np.ones_like(u, float)], -1)
+    depth = (normal @ [0, 0, 0.8] / (rays @ normal)).astype(np.float32)
+    found = _kernels.surface_normals(depth, K) / 127
+    np.testing.assert_allclose(np.abs(found[10:-10, 10:-10] @ normal), 1, atol=0.02)
+
+
+def test_alignment_mends_a_wrong_pose_and_the_energy_says_so() -> None:
+    scene = two_plates()
+    clip, owner = moving_planes.film(scene)
+    pictures = extract_features(clip, 4.0)
+    uv = queries(owner, 1, count=200, border=3).astype(int)
+    points = pictures.unproject(uv.astype(float), pictures.smooth[0, uv[:, 1], uv[:, 0]].astype(float))[None]
+    features = _kernels.features_at(pictures.feature[0], uv.astype(np.float32))[None]
+    t = 10
+    plate = scene[1]
+    R_true = plate.R[t] @ plate.R[0].T
+    s_true = plate.t[t] - R_true @ plate.t[0]
+    off = Rotation.from_rotvec([0.01, -0.01, 0.02]).as_matrix() @ R_true, s_true + np.array([0.004, -0.003, 0.003])
+    R, s = _kernels.align(
+        points, features[..., 1].astype(float), off[0][None], off[1][None], pictures.lightness(t), pictures.smooth[t],
+        pictures.normal[t], pictures.K, 10,
+    )  # fmt: skip
+    moved = (np.linalg.norm(points[0] @ (Q - R_true).T + (x - s_true), axis=1).mean() for Q, x in [(R[0], s[0]), off])
+    after, before = moved
+    assert after < 0.001
+    assert after < 0.2 * before
+    candidates = np.stack([R_true, off[0], np.eye(3)])[None], np.stack([s_true, off[1], np.zeros(3)])[None]
+    energy, seen = _kernels.energies(
+        points, features, *candidates, pictures.depth[t], pictures.feature[t], pictures.K, 1
+    )
+    assert energy[0].argmin() == 0
+    assert seen[0, 0] > 0.95

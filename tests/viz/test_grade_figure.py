@@ -1,0 +1,73 @@
+"""The picture of grades shows the figures that it is given."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from flowlab.geometry.camera import Camera
+from flowlab.grading.ground_truth import GroundTruth
+from flowlab.grading.metrics import CURVE_MM, Estimate, TrackMetrics, measure
+from flowlab.viz.grade_figure import GROUPS, RELIABILITY_POINTS, compose, draw_grades
+
+CAMERA = Camera(320, 240, np.diag([250.0, 250.0, 1.0]), np.eye(4))
+
+
+def make_metrics(error_m: float, *, roles: bool = True, sigma: bool = True) -> TrackMetrics:
+    """Of points that move 10 cm, each off by up to twice ``error_m``, as its sigma says."""
+    rng = np.random.default_rng(0)
+    tracks = np.ones((20, 30, 3), np.float32)
+    tracks[..., 0] += np.linspace(0, 0.1, 20)[:, None]
+    visible = rng.random((20, 30)) < 0.7
+    truth = GroundTruth(np.zeros((30, 2), np.float32), tracks, visible, np.full(30, 2, np.int8) if roles else None)
+    error = rng.uniform(0, 2 * error_m, (20, 30))
+    stated = (error * 1.1).astype(np.float32) if sigma else None
+    return measure(Estimate((tracks + error[..., None] * [0, 0, 1]).astype(np.float32), visible, stated), truth, CAMERA)
+
+
+def test_a_panel_for_each_group_and_a_line_for_each_tracker() -> None:
+    metrics = {"good": make_metrics(0.002), "poor": make_metrics(0.02, sigma=False)}
+    figure = compose(metrics, "two trackers", "made by hand")
+    *panels, reliability = figure.axes
+    assert [p.get_title(loc="left") for p in panels] == list(GROUPS.values())
+    for panel, group in zip(panels, GROUPS, strict=True):
+        for line, of_tracker in zip(panel.lines, metrics.values(), strict=True):
+            np.testing.assert_array_equal(line.get_xdata(), CURVE_MM)
+            np.testing.assert_array_equal(line.get_ydata(), getattr(of_tracker, group).curve)
+    assert panels[0].lines[0].get_color() != panels[0].lines[1].get_color()
+    assert len(reliability.lines) == 2, "the diagonal, and the only tracker that states its error"
+    calibration = metrics["good"].calibration
+    assert calibration is not None
+    drawn = np.array(calibration.count) >= RELIABILITY_POINTS
+    np.testing.assert_array_equal(reliability.lines[1].get_ydata(), np.array(calibration.true_mm)[drawn])
+    (legend,) = figure.legends
+    assert [t.get_text() for t in legend.get_texts()] == ["good", "poor"]
+    words = {t.get_text() for t in figure.texts}
+    assert {"two trackers", "made by hand"} <= words
+
+
+def test_absent_groups_have_no_panel() -> None:
+    figure = compose({"only": make_metrics(0.01, roles=False, sigma=False)}, "camera moves")
+    assert [a.get_title(loc="left") for a in figure.axes] == [GROUPS["all"]]
+    nothing = replace(make_metrics(0.01, roles=False, sigma=False), all=None)
+    assert len(compose({"nothing": nothing}, "a single frame").axes) == 1
+
+
+def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "deeper" / "grade.png"
+    draw_grades({"only": make_metrics(0.01)}, path, title="written")
+    picture = imread(path)
+    assert picture.shape[1] > 2 * picture.shape[0]
+    assert picture[..., :3].min() < 0.5
+    before = path.read_bytes()
+
+    def fails(*_: object) -> None:
+        raise OSError("no space is left")
+
+    monkeypatch.setattr("os.replace", fails)
+    with pytest.raises(OSError, match="no space"):
+        draw_grades({"only": make_metrics(0.02)}, path, title="lost")
+    assert path.read_bytes() == before
+    assert [f.name for f in path.parent.iterdir()] == ["grade.png"]
