@@ -11,6 +11,7 @@ from pydantic import ValidationError, model_validator
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.files import read_json
+from flowlab.provenance import Provenance
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.version import __version__
@@ -40,6 +41,8 @@ class Manifest(Settings):
     first_seed: int
     requested: Mapping[str, int]
     """Episodes asked for, by task."""
+    provenance: Provenance = Provenance()
+    """Where the episodes come from, and what their numbers mean."""
     recordings: tuple[Recorded, ...] = ()
     """What the episodes are made from, where that is no simulation."""
 
