@@ -39,8 +39,8 @@ class ROSReader:
     """Reads one RGB-D camera, and the robot, from a recording of ROS."""
 
     name = "ros"
-    looks_for = "a ROS .bag, .mcap or .db3 file (the RealSense SDK's .db3 too), or the folder of a ROS 2 recording"
-    general = False
+    expects = "a ROS .bag, .mcap or .db3 file (the RealSense SDK's .db3 too), or the folder of a ROS 2 recording"
+    fallback = False
 
     def probe(self, path: Path) -> bool:
         """Whether it is a recording of ROS, and none of the RealSense SDK."""
