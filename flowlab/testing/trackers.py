@@ -30,6 +30,9 @@ BIAS_PX = 0.25
 MEDIAN_PX = 1.0
 SAME_PX = 0.01
 
+_CHANNELS = {"xy": (2,), "xyz_cam": (3,)}
+"""What fields of a record have besides frames and points."""
+
 MakeTracker = Callable[[], Tracker]
 
 
@@ -188,13 +191,33 @@ def _check_record(tracks: Tracks2D, frames: int, points: int) -> None:
         if value is None and field.default is None:
             continue
         dtype = np.dtype(bool if field.name == "visible" else np.float32)
-        shape = (frames, points, 2) if field.name == "xy" else (frames, points)
+        shape = (frames, points, *_CHANNELS.get(field.name, ()))
         _require(isinstance(value, np.ndarray), f"{field.name} must be a numpy array, but is a {type(value).__name__}")
         _require(value.dtype == dtype, f"{field.name} must be {dtype}, but is {value.dtype}")
         _require(value.shape == shape, f"{field.name} must have shape {shape}, but has {value.shape}")
         _require(np.isfinite(value).all(), f"{field.name} must be finite, also where a point is lost")
     sure = tracks.confidence
     _require(((sure >= 0) & (sure <= 1)).all(), "confidence must lie between 0 and 1")
+    _check_positions(tracks)
+
+
+def _check_positions(tracks: Tracks2D) -> None:
+    """What a model says in 3D is what the tracks say in the picture."""
+    if tracks.xyz_cam is None:
+        return
+    placed = (tracks.xyz_cam != 0).any(-1)
+    _require(
+        (tracks.xyz_cam[placed][:, 2] > 0).all(),
+        "xyz_cam must lie before the camera, z forward [m], or be (0, 0, 0) where no position is known",
+    )
+    uv, _ = rolling().clip.camera.project(tracks.xyz_cam[placed].astype(np.float64))
+    off = np.linalg.norm(uv - tracks.xy[placed], axis=-1)[tracks.visible[placed]]
+    median = float(np.median(off)) if len(off) else 0.0
+    _require(
+        median < MEDIAN_PX,
+        f"xyz_cam must project to xy, but is {median:.2f} px away; it is in the camera frame [m]: x right, y down, "
+        "z forward",
+    )
 
 
 def _check_motion(tracks: Tracks2D, queries: np.ndarray, start: int) -> None:

@@ -235,8 +235,6 @@ def test_alignment_mends_a_wrong_pose_and_the_energy_says_so() -> None:
     assert after < 0.001
     assert after < 0.2 * before
     candidates = np.stack([R_true, off[0], np.eye(3)])[None], np.stack([s_true, off[1], np.zeros(3)])[None]
-    energy, seen = _costs.energies(
-        points, features, *candidates, pictures.depth[t], pictures.feature[t], pictures.K, 1
-    )
+    energy, seen = _costs.energies(points, features, *candidates, pictures.depth[t], pictures.feature[t], pictures.K, 1)
     assert energy[0].argmin() == 0
     assert seen[0, 0] > 0.95
