@@ -135,6 +135,15 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
 
 
+def known_beforehand(path: Path, settings: RecordingSettings) -> Metadata:
+    """What the user says of a recording, in the calibration file and in ``recording.yaml`` in or beside it.
+
+    Raises:
+        DataError: One of these files is not as it should be.
+    """
+    return combine(_given(path, settings))[0]
+
+
 def _given(path: Path, settings: RecordingSettings) -> Iterator[tuple[str, Metadata]]:
     """What the user says, most important first: the calibration file, then ``recording.yaml`` in or beside it."""
     if settings.calibration is not None:

@@ -65,6 +65,8 @@ def _cameras(episode: Path) -> list[Path]:
 
 def _choose(episode: Path, serial: str | None) -> Path:
     cameras = _cameras(episode)
+    if not cameras:
+        raise DataError(f"{episode}: has no folder cam_<serial> with color/ and depth/ in it")
     serials = [c.name.removeprefix("cam_") for c in cameras]
     if serial is None and len(cameras) == 1:
         return cameras[0]

@@ -46,7 +46,8 @@ class ROSReader:
         """Whether it is a recording of ROS, and none of the RealSense SDK."""
         if path.is_dir():
             return (path / "metadata.yaml").is_file() and any(f.suffix in (".mcap", ".db3") for f in path.iterdir())
-        return path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
+        known = path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
+        return known and path.is_file()
 
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams. Topics are found by type, encoding and name, or as ``topics`` says."""
