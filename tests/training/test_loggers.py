@@ -56,10 +56,10 @@ LOGGING = """
 import json, sys
 from pathlib import Path
 from flowlab.errors import FlowlabError
-from flowlab.training.loggers import make_log
+from flowlab.training.loggers import make_logger
 folder, settings, written = sys.argv[1], *map(json.loads, sys.argv[2:])
 try:
-    log = make_log("wandb", Path(folder), "push-fdp", settings)
+    log = make_logger("wandb", Path(folder), "push-fdp", settings)
 except FlowlabError as error:
     sys.exit(f"{type(error).__name__}: {error}")
 for step, values in written:
