@@ -34,22 +34,23 @@ class Manifest(Settings):
     """Name of the recipe."""
     settings: Mapping[str, Any]
     """Every setting of every stage, by stage name."""
-    camera: Mapping[str, Any]
-    """K [px] and T_world_cam, see :class:`flowlab.geometry.Camera`; empty where every recording has its own."""
-    world_frame: str
     units: Mapping[str, str] = UNITS
     first_seed: int
     requested: Mapping[str, int]
     """Episodes asked for, by task."""
-    provenance: Provenance = Provenance()
+    provenance: Provenance
     """Where the episodes come from, and what their numbers mean."""
     recordings: tuple[Recorded, ...] = ()
     """What the episodes are made from, where that is no simulation."""
+    first_settings_digest: str = ""
+    """Of a dataset that an earlier flowlab began: what its shards call the settings; empty in others."""
 
     @property
     def settings_digest(self) -> str:
-        """Identifies the settings; every shard carries it."""
-        stages = list(json.loads(self.model_dump_json())["settings"].items())  # in order, which matters too
+        """Identifies the settings of the stages, in their order, whatever the stages are called; every shard has it."""
+        if self.first_settings_digest:
+            return self.first_settings_digest
+        stages = list(json.loads(self.model_dump_json())["settings"].values())
         return hashlib.sha256(json.dumps(stages, sort_keys=True).encode()).hexdigest()[:16]
 
     @classmethod
@@ -84,6 +85,8 @@ class Reject(Settings):
     """Path of the recording."""
     position: int | None = None
     """Index of the episode within the shard of its unit's rejects; None where there is nothing to look at."""
+    retry: bool = False
+    """Whether the next run tries again, since the cause lies outside the dataset: a recording could not be opened."""
 
 
 class StageTally(Settings):
