@@ -12,6 +12,7 @@ from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.files import read_json
 from flowlab.provenance import Provenance
+from flowlab.storage.migrations import migrate_manifest, migrate_receipt
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.version import __version__
@@ -67,7 +68,7 @@ class Manifest(Settings):
                 "use the flowlab version that wrote it"
             )
         try:
-            return cls.model_validate(values)
+            return cls.model_validate(migrate_manifest(values))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"]))
@@ -153,7 +154,7 @@ def read_receipts(folder: Path) -> list[Receipt]:
         if path.name.startswith("."):
             continue
         try:
-            receipts.append(Receipt.model_validate(read_json(path)))
+            receipts.append(Receipt.model_validate(migrate_receipt(read_json(path))))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"])) or "lists"
