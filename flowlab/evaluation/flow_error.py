@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from flowlab.evaluation.trials import RolloutFlowError
-from flowlab.grading.metrics import tapvid
+from flowlab.grading.tapvid import tapvid
 from flowlab.records import Queries
 from flowlab.sim.recorder import Rollout
 from flowlab.sim.tracks import RigidFlowSettings, rigid_tracks

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from flowlab.files import temporary_path
-from flowlab.grading.metrics import CURVE_MM, Calibration, TrackMetrics
+from flowlab.grading.calibration import Calibration
+from flowlab.grading.metrics import CURVE_MM, TrackMetrics
 
 GROUPS = {
     "all": "all visible points",
