@@ -88,7 +88,9 @@ def evaluate_offline(loaded: LoadedPolicy, data: Path | None = None) -> OfflineR
     buffer = load_buffer(source, run, loaded.policy.needs.pictures)
     _check_fit(loaded.policy.spec, buffer, source.path)
     buffer = _only(buffer, _unseen(loaded, run, source, buffer))
-    judge = _OfflineEvaluator(loaded.policy, buffer, _cameras(source.path, buffer) if source.provenance.kind != "imported" else None)
+    judge = _OfflineEvaluator(
+        loaded.policy, buffer, _cameras(source.path, buffer) if source.provenance.kind != "imported" else None
+    )
     each = [judge.measure(k) for k in range(len(buffer.episodes))]
     return OfflineReport(
         policy=loaded.policy.spec.settings.policy,

@@ -7,12 +7,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from flowlab.storage.migrations import migrate_observer
+
 FORMAT = 2
 """Of ``policy.json`` and of files of weights."""
 _SETTINGS = {"history": "n_obs_steps", "executed": "n_action_steps", "optimiser": "optimizer"}
 _SPEC = {"normaliser": "normalizer", "layout": "channels"}
 _CHANNELS = {"state_places": "state_positions", "action_place": "action_position"}
-_OUTLIERS = {"neighbours": "neighbors", "deviations": "std_ratio"}
 _MOTION_OF_ALL = {"condition", "condition_noise", "weight", "features", "denoiser"}
 """Settings of a motion that every policy has which predicts one; the others were 3D FDP's alone."""
 _TENSORS = (
@@ -43,7 +44,7 @@ def migrate_policy(values: Any) -> Any:
     spec["channels"] = _renamed(spec.get("channels"), _CHANNELS)
     spec["normalizer"] = _normalizer(spec.get("normalizer"), spec["settings"])
     if isinstance(observer := spec.get("observer"), dict):
-        spec["observer"] = {**observer, "remove_outliers": _renamed(observer.get("remove_outliers"), _OUTLIERS)}
+        spec["observer"] = migrate_observer(dict(observer))
     return {**moved, "format": FORMAT, "policy": spec}
 
 
