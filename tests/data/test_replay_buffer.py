@@ -117,7 +117,7 @@ def test_beside_a_dataset_that_cannot_be_written_the_run_keeps_the_corpus(tmp_pa
     check(load_buffer(source, tmp_path / "run"), episodes)  # what the run has is not decoded again elsewhere
     block(tmp_path / "d")
     block(tmp_path / "other")
-    with pytest.raises(DataError, match=f"{tmp_path / 'other'}: cannot be written; choose another folder with --out"):
+    with pytest.raises(DataError, match=f"{tmp_path / 'other'}: cannot be written; choose another --out"):
         load_buffer(source, tmp_path / "other")
 
 

@@ -37,7 +37,9 @@ def make(name: str, *overrides: str, places: ChannelSpec | None = None, **change
 
 
 def variant(name: str, network: str, layout: str, *overrides: str, **changes: Any) -> tuple[Any, Batch]:
-    return make(name, f"action={network}", *motion_settings(name, layout, f"motion.denoiser={network}"), *overrides, **changes)
+    return make(
+        name, f"action={network}", *motion_settings(name, layout, f"motion.denoiser={network}"), *overrides, **changes
+    )
 
 
 def motion_settings(name: str, layout: str, *others: str) -> tuple[str, ...]:
