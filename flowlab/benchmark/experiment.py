@@ -19,8 +19,10 @@ from flowlab.evaluation.evaluate import CheckpointRef, find_checkpoints, run_mis
 from flowlab.evaluation.trials import Trial, trials
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
+from flowlab.data.settings import TrainSettings
 from flowlab.policies.checkpoint import RUN, newest_checkpoint, read_run_config, read_trained, step_of
-from flowlab.policies.settings import POLICIES, TrainSettings, load_settings
+from flowlab.policies.settings import AnyTrainSettings, load_settings
+from flowlab.registry import POLICIES
 from flowlab.sim.tasks import GROUPS, select_tasks
 from flowlab.storage.manifest import differences
 from flowlab.training import run
@@ -78,7 +80,7 @@ class ExperimentUnit(Settings):
     task: str
     dataset: str
     """Folder below the experiment's."""
-    settings: TrainSettings
+    settings: AnyTrainSettings
 
 
 def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
@@ -112,8 +114,8 @@ def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
     stands for two, and where settings do not fit each other."""
     _wanted(recipe, recipe.tasks[0])
     for name in recipe.policies:
-        if name not in POLICIES:
-            raise unknown_name("policy", name, POLICIES)
+        if name not in POLICIES.plugins():
+            raise unknown_name("policy", name, POLICIES.plugins())
     tasks = _tasks(recipe.tasks)
     units = [_unit(recipe, task, policy) for task in tasks for policy in recipe.policies]
     for variant in recipe.variants:
@@ -205,7 +207,8 @@ def _extract(recipe: ExperimentRecipe, todo: Sequence[ExperimentUnit], out: Path
     """Make the datasets that units need: a moment's work beside training."""
     engine = partial(LocalEngine, workers=workers)
     for folder, unit in {u.dataset: u for u in todo}.items():
-        sampling = unit.settings.motion.sampling
+        flow = unit.settings.needs.flow
+        sampling = "scene" if flow is None else flow.sampling
         changes = [
             f"episodes={recipe.demonstrations + 1}",
             f"queries.points={recipe.query_points}",
@@ -225,10 +228,11 @@ def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVaria
         *(variant.set if variant else ()),
     ]
     settings = load_settings(recipe.profile, policy, changes)
-    sampling, points = settings.motion.sampling, settings.motion.points
-    if policy == "fdp" and points > recipe.query_points:
+    flow = settings.needs.flow
+    sampling = "scene" if flow is None else flow.sampling
+    if flow is not None and flow.points > recipe.query_points:
         raise UsageError(
-            f"experiment {recipe.name}: {task}-{label} wants {points} query points, and the datasets get "
+            f"experiment {recipe.name}: {task}-{label} wants {flow.points} query points, and the datasets get "
             f"{recipe.query_points}; raise query_points"
         )
     return ExperimentUnit(

@@ -1,7 +1,6 @@
 """A policy's side of one episode: what it remembers, and what it has decided to do."""
 
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -50,9 +49,11 @@ class PolicyRunner:
     def see(self, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
         """Take in a step that the actor looks at. Raises :class:`DataError` where the frame shows nothing."""
         cloud = self._observer.cloud(frame)
-        points = self._observer.sample(cloud).points_world[: self.spec.settings.encoder.points]
+        needs = self.spec.settings.needs
+        wanted = 0 if needs.point_cloud is None else needs.point_cloud.points
+        points = self._observer.sample(cloud).points_world[:wanted]
         first = not self._seen
-        if first and self.spec.settings.policy == "fdp":
+        if first and needs.flow is not None:
             self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
         times = self.spec.settings.n_obs_steps if first else 1  # what was before the first step is taken to be like it
         self._seen.extend([(points, np.asarray(state, np.float32))] * times)
@@ -76,15 +77,3 @@ class PolicyRunner:
     def act(self) -> Float32[np.ndarray, "A"]:
         """The action of this step."""
         return self._planned.popleft()
-
-
-def concatenate(contexts: Sequence[ObservationBatch]) -> ObservationBatch:
-    """Contexts of one window each as one context."""
-    frames = np.cumsum([0, *(len(c.points) for c in contexts)])
-    return ObservationBatch(
-        points=torch.cat([c.points for c in contexts]),
-        state=torch.cat([c.state for c in contexts]),
-        observed=torch.cat([c.observed + int(n) for c, n in zip(contexts, frames[:-1], strict=True)]),
-        queries=torch.cat([c.queries for c in contexts]),
-        task=torch.cat([c.task for c in contexts]),
-    )

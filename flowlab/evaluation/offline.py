@@ -9,9 +9,12 @@ import numpy as np
 import torch
 
 from flowlab.config import Settings
-from flowlab.data.batches import Batch, BatchBuilder, ObservationBatch, WindowIndex, choose_queries, index_windows
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch, ObservationBatch
+from flowlab.data.query_points import choose_queries
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.window_sampler import WindowIndex, index_windows
 from flowlab.errors import DataError
 from flowlab.evaluation.flow_metrics import FlowErrors, PointStepErrors, pool_errors
 from flowlab.geometry.camera import Camera
@@ -82,11 +85,13 @@ def evaluate_offline(loaded: LoadedPolicy, data: Path | None = None) -> OfflineR
     run = loaded.path.absolute().parents[1]
     source = _open(loaded, run, data)
     check_observer(loaded.trained, run, source)
-    buffer = load_buffer(source, run)
+    buffer = load_buffer(source, run, loaded.policy.needs.pictures)
     _check_fit(loaded.policy.spec, buffer, source.path)
     buffer = _only(buffer, _unseen(loaded, run, source, buffer))
-    judge = _OfflineEvaluator(loaded.policy, buffer, _cameras(source.path, buffer) if source.settings else None)
-    each = [judge.measure(k) for k in range(len(buffer.demos))]
+    judge = _OfflineEvaluator(
+        loaded.policy, buffer, _cameras(source.path, buffer) if source.provenance.kind != "imported" else None
+    )
+    each = [judge.measure(k) for k in range(len(buffer.episodes))]
     return OfflineReport(
         policy=loaded.policy.spec.settings.policy,
         step=loaded.step,
@@ -151,11 +156,11 @@ class _OfflineEvaluator:
         s, spec = policy.spec.settings, policy.spec
         self._builder = BatchBuilder(buffer, spec.channels, s, spec.tasks)
         self._device = next(policy.parameters()).device
-        self._columns = choose_queries(buffer, s.motion) if s.policy == "fdp" else None
+        self._columns = None if s.needs.flow is None else choose_queries(buffer, s.needs.flow)
 
     def measure(self, demo: int) -> DemonstrationErrors:
         """All errors on one demonstration."""
-        about = self._buffer.demos[demo]
+        about = self._buffer.episodes[demo]
         return DemonstrationErrors(
             task=about.task,
             seed=about.seed,
@@ -214,9 +219,9 @@ class _OfflineEvaluator:
     def _labels(self, windows: WindowIndex, steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Where the query points are after 1, 2, ... actions (W, K, M, 3) [m], and whether they are seen (W, K, M)."""
         assert self._columns is not None
-        stop = np.array([d.stop for d in self._buffer.demos])[windows.demo]
+        stop = np.array([d.stop for d in self._buffer.episodes])[windows.episode]
         row = np.minimum(windows.now[:, None] + np.arange(1, steps + 1), stop[:, None] - 1)
-        column = self._columns[windows.demo][:, None]
+        column = self._columns[windows.episode][:, None]
         return self._buffer.tracks[row[..., None], column], self._buffer.visible[row[..., None], column]
 
 
@@ -228,6 +233,8 @@ def _repeated(batch: Batch, times: int) -> ObservationBatch:
         observed=batch.observed.repeat(times, 1),
         queries=batch.queries.repeat(times, 1, 1),
         task=batch.task.repeat(times),
+        rgb=batch.rgb,
+        depth=batch.depth,
     )
 
 
@@ -265,8 +272,10 @@ def _check_fit(spec: PolicySpec, buffer: ReplayBuffer, where: Path) -> None:
     ):
         if found != wanted:
             raise DataError(f"{where}: '{name}' is {found} wide, and {wanted} in what the policy was trained on")
-    if spec.settings.policy == "mba" and buffer.object_pose.shape[1] != 9:
-        raise DataError(f"{where}: has no object poses, which mba predicts; evaluate it on a dataset that has them")
+    if missing := spec.settings.needs.missing_from(buffer):
+        raise DataError(
+            f"{where}: has no {missing}, which {spec.settings.policy} needs; evaluate it on a dataset that has them"
+        )
     if not set(spec.tasks) & set(buffer.tasks):
         raise DataError(
             f"{where}: has the tasks {', '.join(buffer.tasks)}, and the policy was trained on {', '.join(spec.tasks)}"
@@ -284,8 +293,8 @@ def _unseen(loaded: LoadedPolicy, run: Path, source: TrainingSource, buffer: Rep
             "with --data"
         )
     known = _known_layouts(loaded.trained, run, source)
-    of_tasks = [k for k, d in enumerate(buffer.demos) if d.task in loaded.trained.policy.tasks]
-    if found := [k for k in of_tasks if (buffer.demos[k].task, buffer.demos[k].seed) not in known]:
+    of_tasks = [k for k, d in enumerate(buffer.episodes) if d.task in loaded.trained.policy.tasks]
+    if found := [k for k in of_tasks if (buffer.episodes[k].task, buffer.episodes[k].seed) not in known]:
         return found
     raise DataError(
         f"{source.path}: the policy was trained on the layouts of all its {len(of_tasks)} demonstrations; give a "
@@ -296,7 +305,7 @@ def _unseen(loaded: LoadedPolicy, run: Path, source: TrainingSource, buffer: Rep
 def _known_layouts(trained: TrainedPolicy, run: Path, source: TrainingSource) -> set[tuple[str, int]]:
     """Simulated layouts, by task and seed, that a policy was trained on and that another dataset may hold too."""
     planned = read_run_config(run) if (run / RUN).exists() else None
-    if "expert" in source.settings:
+    if source.provenance.is_simulated:
         scene_seeds = [(task, seed) for task in sorted(trained.scene_seeds) for seed in trained.scene_seeds[task]]
         return set([scene_seeds[k] for k in planned.train] if scene_seeds and planned is not None else scene_seeds)
     if planned is not None and source.path.resolve() == planned.dataset:
@@ -311,11 +320,11 @@ def _only(buffer: ReplayBuffer, demos: Sequence[int]) -> ReplayBuffer:
     """The corpus with some of its demonstrations."""
     names = ("queries", "query_role", "query_count")
     mine: dict[str, Any] = {name: getattr(buffer, name)[list(demos)] for name in names}
-    return replace(buffer, demos=tuple(buffer.demos[k] for k in demos), **mine)
+    return replace(buffer, episodes=tuple(buffer.episodes[k] for k in demos), **mine)
 
 
 def _cameras(path: Path, buffer: ReplayBuffer) -> list[Camera]:
     """The camera of every demonstration: a simulated dataset's, or its recording's."""
     shards = {(r.task, r.seed): r.shard for r in Dataset(path).refs}
-    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.demos}}
-    return [Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in buffer.demos]
+    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
+    return [Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in buffer.episodes]

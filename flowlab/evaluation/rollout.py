@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float32
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.deployment.runner import PolicyRunner, concatenate
+from flowlab.deployment.runner import PolicyRunner
 from flowlab.errors import DataError
 from flowlab.evaluation.flow_error import flow_error
 from flowlab.evaluation.trials import EpisodeResult, Trial
@@ -79,7 +79,7 @@ def roll_out(
         if not ready:
             continue
         spare = ready[0].context()
-        whole = concatenate([lane.context() if lane in ready else spare for lane in lanes]).to(device)
+        whole = ObservationBatch.concatenate([lane.context() if lane in ready else spare for lane in lanes]).to(device)
         plan = policy.plan(whole, [lane.noise for lane in lanes])
         yield from (attempt for lane in ready if (attempt := lane.go_on(plan)) is not None)
 
