@@ -7,10 +7,11 @@ from flowlab.version import __version__
 
 if TYPE_CHECKING:
     from flowlab.deployment.policy import Policy
+    from flowlab.evaluation.evaluate import evaluate
 
-__all__ = ["Policy", "__version__"]
+__all__ = ["Policy", "__version__", "evaluate"]
 
-_LAZY = {"Policy": "flowlab.deployment.policy"}
+_LAZY = {"Policy": "flowlab.deployment.policy", "evaluate": "flowlab.evaluation.evaluate"}
 """Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""
 
 

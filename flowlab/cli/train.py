@@ -4,12 +4,13 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import TrainingBar, console, print_json, print_table
+from flowlab.cli.console import STEPS_LINE, ProgressBar, console, print_json, print_table, show_training
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
@@ -95,8 +96,8 @@ def train(
     first = trainer.processes.is_first
     if first and not as_json:
         _describe(trainer)
-    with TrainingBar(quiet=as_json or not first) as bar, _stop_on_signal() as asked:
-        finished = run.run(trainer, bar.update, lambda: bool(asked))
+    with ProgressBar(as_json or not first, STEPS_LINE) as bar, _stop_on_signal() as asked:
+        finished = run.run(trainer, partial(show_training, bar), lambda: bool(asked))
     if first:
         _finish(trainer, finished, as_json)
     if not finished:
@@ -126,7 +127,7 @@ def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
     """Draw the curve, and print what came out."""
     from flowlab.policies.checkpoint import writing_run
     from flowlab.training.metrics import METRICS, last_metrics
-    from flowlab.viz.curve_figure import draw_curve
+    from flowlab.viz.training_figure import draw_training
 
     folder = trainer.folder
     metrics = folder / METRICS
@@ -141,7 +142,7 @@ def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
     }
     if report["training"] or report["validation"]:
         with writing_run(folder):
-            draw_curve(metrics, folder / "curve.png")
+            draw_training(metrics, folder / "curve.png")
     if as_json:
         print_json(report)
         return

@@ -16,9 +16,10 @@ from flowlab.records import Frame, Queries
 
 
 class PolicyRunner:
-    """Shown every step of an episode, gives the action for it.
+    """Shown the frames of an episode that a plan needs, hands out the action of every step.
 
-    Every ``n_action_steps`` steps a plan is due; it looks at the last frames only, so that no others need be taken.
+    Every ``n_action_steps`` steps a plan is due; it is decided on the last frames only, so that no others need be
+    taken.
     """
 
     def __init__(self, spec: PolicySpec, task: str, seed: int, n_action_steps: int | None = None) -> None:
@@ -34,57 +35,65 @@ class PolicyRunner:
         """The points whose motion is predicted; None for policies that predict none."""
         self._observer = Observer(ObserverSettings.model_validate(spec.observer), task)
         self._task = torch.tensor([spec.tasks.index(task)])
-        self._seen: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=s.n_obs_steps)
-        self._planned: deque[np.ndarray] = deque()
+        self._history: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=s.n_obs_steps)
+        self._actions: deque[np.ndarray] = deque()
 
     @property
-    def plan_is_due(self) -> bool:
-        """Whether the next action needs a plan."""
-        return not self._planned
+    def needs_plan(self) -> bool:
+        """Whether the next action needs a new plan."""
+        return not self._actions
 
     @property
     def needs_frame(self) -> bool:
-        """Whether a plan will look at the frame of this step."""
-        return len(self._planned) < self.spec.settings.n_obs_steps
+        """Whether a plan will be decided on the frame of this step."""
+        return len(self._actions) < self.spec.settings.n_obs_steps
 
-    def see(self, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
-        """Take in a step that the actor looks at. Raises :class:`DataError` where the frame shows nothing."""
+    def observe(self, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
+        """Take in a step that a plan will be decided on.
+
+        Args:
+            frame: What the camera sees: depth [m], and the camera's pose in the dataset's world frame.
+            state: The robot's, laid out as in the training data.
+
+        Raises:
+            DataError: The frame shows nothing.
+        """
         cloud = self._observer.cloud(frame)
         points = self._observer.sample(cloud).points_world[: self.spec.settings.encoder.points]
-        first = not self._seen
+        first = not self._history
         if first and self.spec.settings.policy == "fdp":
             self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
         times = self.spec.settings.n_obs_steps if first else 1  # what was before the first step is taken to be like it
-        self._seen.extend([(points, np.asarray(state, np.float32))] * times)
+        self._history.extend([(points, np.asarray(state, np.float32))] * times)
 
-    def context(self) -> ObservationBatch:
-        """What a plan is to be decided on."""
+    def observation(self) -> ObservationBatch:
+        """What a plan is to be decided on, as one window."""
         queries = np.zeros((0, 3), np.float32) if self.queries is None else self.queries.xyz_world
         return ObservationBatch(
-            points=torch.from_numpy(np.stack([points for points, _ in self._seen])),
-            state=torch.from_numpy(np.stack([state for _, state in self._seen])),
-            observed=torch.arange(len(self._seen))[None],
+            points=torch.from_numpy(np.stack([points for points, _ in self._history])),
+            state=torch.from_numpy(np.stack([state for _, state in self._history])),
+            observed=torch.arange(len(self._history))[None],
             queries=torch.from_numpy(queries)[None],
             task=self._task,
         )
 
-    def follow(self, plan: ActionPlan, window: int = 0) -> None:
-        """Do what a plan says for one of its windows."""
+    def execute(self, plan: ActionPlan, window: int = 0) -> None:
+        """Hand out the actions of one window of a plan from now on."""
         now = self.spec.settings.n_obs_steps - 1
-        self._planned.extend(plan.action[window, now : now + self.n_action_steps].cpu().numpy())
+        self._actions.extend(plan.action[window, now : now + self.n_action_steps].cpu().numpy())
 
-    def act(self) -> Float32[np.ndarray, "A"]:
-        """The action of this step."""
-        return self._planned.popleft()
+    def next_action(self) -> Float32[np.ndarray, "A"]:
+        """The action of this step, in the dataset's units."""
+        return self._actions.popleft()
 
 
-def concatenate(contexts: Sequence[ObservationBatch]) -> ObservationBatch:
-    """Contexts of one window each as one context."""
-    frames = np.cumsum([0, *(len(c.points) for c in contexts)])
+def concatenate(observations: Sequence[ObservationBatch]) -> ObservationBatch:
+    """Observations of one window each as one batch."""
+    frames = np.cumsum([0, *(len(o.points) for o in observations)])
     return ObservationBatch(
-        points=torch.cat([c.points for c in contexts]),
-        state=torch.cat([c.state for c in contexts]),
-        observed=torch.cat([c.observed + int(n) for c, n in zip(contexts, frames[:-1], strict=True)]),
-        queries=torch.cat([c.queries for c in contexts]),
-        task=torch.cat([c.task for c in contexts]),
+        points=torch.cat([o.points for o in observations]),
+        state=torch.cat([o.state for o in observations]),
+        observed=torch.cat([o.observed + int(n) for o, n in zip(observations, frames[:-1], strict=True)]),
+        queries=torch.cat([o.queries for o in observations]),
+        task=torch.cat([o.task for o in observations]),
     )
