@@ -26,7 +26,7 @@ class Camera:
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float, T_world_cam: np.ndarray) -> "Camera":
-        """A centerd camera with square pixels and the vertical field of view ``fovy_deg``."""
+        """A centered camera with square pixels and the vertical field of view ``fovy_deg``."""
         f = 0.5 * height / np.tan(np.deg2rad(fovy_deg) / 2)
         K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
         return cls(width, height, K, T_world_cam)

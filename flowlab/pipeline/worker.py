@@ -26,13 +26,13 @@ def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUni
         try:
             episodes.append(pipeline.run(request))
         except Rejected as rejected:
-            stage, reason = rejected.args
             position = None
             if rejected.episode is not None:
                 position = len(kept)
                 kept.append(pipeline.writer.process(rejected.episode))
             about = request.model_dump()
-            rejects.append(Reject(**about, stage=stage, reason=reason, position=position))
+            why = {"stage": rejected.stage, "reason": rejected.reason, "retry": rejected.retry}
+            rejects.append(Reject(**about, **why, position=position))
     for place, found in ("shards", episodes), ("rejects", kept):
         _store(pipeline, folder / place / f"{unit.name}.zarr", found, settings_digest)
     receipt = Receipt(

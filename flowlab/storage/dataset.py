@@ -182,7 +182,7 @@ def _check_settings(folder: Path, old: Manifest, manifest: Manifest) -> None:
     mine = json.loads(manifest.model_dump_json())
     theirs = json.loads(old.model_dump_json())
     for values in (theirs, mine):
-        values["stages"] = list(values["settings"])
+        values |= {"stages": list(values["settings"]), "camera": values["provenance"]["camera"]}
     compared = ("stages", "settings", "first_seed", "camera")
     lines = list(differences({k: theirs[k] for k in compared}, {k: mine[k] for k in compared}))
     if lines:

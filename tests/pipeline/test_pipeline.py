@@ -76,7 +76,7 @@ def run_all(pipeline: Pipeline, seeds: Sequence[int]) -> tuple[list[Episode], di
         try:
             episodes.append(pipeline.run(EpisodeRequest(task="roll", seed=seed)))
         except Rejected as error:
-            rejected[seed] = error.args
+            rejected[seed] = error.stage, str(error)
     return episodes, rejected
 
 
@@ -255,7 +255,7 @@ def test_a_real_rejection_names_the_stage() -> None:
     pipeline = recipe.pipeline()
     with pytest.raises(Rejected) as rejected:
         pipeline.run(EpisodeRequest(task="drawer-open", seed=0))
-    stage, reason = rejected.value.args
+    stage, reason = rejected.value.stage, str(rejected.value)
     assert stage == "observer"
     assert reason.startswith("step 0: drawer-open: no point of the frame lies in the crop")
     counts = {name: (t.calls, t.rejects) for name, t in pipeline.tallies.items()}

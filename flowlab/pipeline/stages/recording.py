@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from flowlab.errors import DataError
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.shared import ObserverStage, QueriesStage, WriteStage, labeled
+from flowlab.provenance import Provenance
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
 from flowlab.records import Clip, Episode, QueriedDemo, TrackedDemo
 from flowlab.tracking.base import make_tracker
@@ -27,6 +28,11 @@ __all__ = [
     "WriteStage",
 ]
 
+WORLD_FRAME = (
+    "each recording's own, as its T_world_cam says; where that is the identity, the axes of its camera: "
+    "x right, y down, z forward"
+)
+
 
 class RecordingStage(Stage, RecordingSettings):
     """A recording is opened, its streams put on one time axis."""
@@ -38,7 +44,11 @@ class RecordingStage(Stage, RecordingSettings):
         try:
             return open_recording(Path(record.source), self, task=record.task, seed=record.seed)
         except DataError as error:
-            raise Rejected(str(error)) from error
+            raise Rejected(str(error), retry=True) from error
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """Recorded, each in a world frame of its own; what the numbers of state and action mean is not known."""
+        return provenance.model_copy(update={"kind": "recorded", "world_frame": WORLD_FRAME})
 
 
 class TrackStage(Stage):
@@ -65,6 +75,10 @@ class TrackStage(Stage):
         # The points came from pixels, and rounding finds these again exactly.
         tracks = follow(clip, np.rint(pixel).astype(np.float32), tracker, self.chunks)
         return TrackedDemo(record, tracks, tracker.describe())
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """The tracks are estimated."""
+        return provenance.model_copy(update={"tracks": "estimated", "tracker": self.tracker})
 
 
 def clip_of(record: QueriedDemo) -> Clip:

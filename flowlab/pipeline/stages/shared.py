@@ -9,10 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.pipeline.stage import Rejected, Stage, Writer
+from flowlab.provenance import Provenance
 from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo, Tracks3D
 from flowlab.storage.shard import write_shard
 
@@ -67,6 +69,10 @@ class ObserverStage(Stage, ObserverSettings):
                 rgb[t] = frame.rgb
         return ObservedDemo(record, points, count, observer.cloud(first), depth, owner, rgb)
 
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """How the clouds were made, so that a policy's are made the same way."""
+        return provenance.model_copy(update={"observer": _settings(self, ObserverSettings)})
+
 
 def _frame(demo: Demonstration, t: int) -> Frame:
     try:
@@ -86,6 +92,15 @@ class QueriesStage(Stage, QuerySettings):
             return QueriedDemo(record, queries_in(record.first_cloud, record.depth[0], self))
         except DataError as error:
             raise Rejected(str(error)) from error
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """How the query points were chosen."""
+        return provenance.model_copy(update={"queries": _settings(self, QuerySettings)})
+
+
+def _settings(stage: Stage, group: type[Settings]) -> dict[str, Any]:
+    """Those settings of a stage that are of a group, as JSON values: neither its name nor what a subclass adds."""
+    return stage.model_dump(mode="json", include=set(group.model_fields))
 
 
 class AcceptStage(Stage):

@@ -6,9 +6,10 @@ from flowlab.errors import DataError
 from flowlab.pipeline.memory import return_freed_memory
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.shared import AcceptStage, ObserverStage, QueriesStage, WriteStage, labeled
+from flowlab.provenance import Provenance
 from flowlab.records import Episode, QueriedDemo
 from flowlab.sim.recorder import ExpertSettings, Rollout, TaskSimulator
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.simulation import SceneSettings, describe_scene
 from flowlab.sim.tracks import RigidFlowSettings, label
 
 __all__ = ["AcceptStage", "ExpertStage", "ObserverStage", "QueriesStage", "RigidFlowStage", "WriteStage"]
@@ -27,6 +28,12 @@ class ExpertStage(Stage, ExpertSettings):
             return self.simulator(record.task).record_expert(record.seed, self)
         except DataError as error:
             raise Rejected(str(error)) from error
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """Simulated by MetaWorld, whose camera and channels are known."""
+        camera = TaskSimulator(task, self.scene).begin(seed=0).camera
+        known = describe_scene(self.scene)
+        return provenance.model_copy(update={**known, "camera": camera.to_json()})
 
     def simulator(self, task: str) -> TaskSimulator:
         """The simulation of a task; the last one used is kept, since units come task by task."""
@@ -53,3 +60,7 @@ class RigidFlowStage(Stage, RigidFlowSettings):
         assert isinstance(demo, Rollout)
         assert seen.owner is not None
         return labeled(record, label(demo, record.queries, seen.depth, seen.owner, self))
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """The tracks are exact."""
+        return provenance.model_copy(update={"tracks": "exact"})
