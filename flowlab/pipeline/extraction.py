@@ -81,7 +81,7 @@ def fill(
         log.unlink(missing_ok=True)
     except OSError as error:
         raise _storage_error(folder, error) from error
-    work = partial(run_unit, recipe.model_dump_json(), manifest.settings_digest, folder)
+    work = partial(run_unit, recipe.model_dump_json(), recipe.folder, manifest.settings_digest, folder)
     try:
         with start_engine(work) as engine:
             failures = run_all(engine, plan_for(manifest), folder, share, report)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -37,7 +37,7 @@ WORLD_FRAME = (
 class RecordingStage(Stage, RecordingSettings):
     """A recording is opened, its streams put on one time axis."""
 
-    stage: Literal["recording"] = "recording"
+    stage: str = "recording"
 
     def process(self, record: EpisodeRequest) -> Recording:
         """Open the recording that the request names."""
@@ -54,7 +54,7 @@ class RecordingStage(Stage, RecordingSettings):
 class TrackStage(Stage):
     """The query points are followed through the pictures."""
 
-    stage: Literal["track"] = "track"
+    stage: str = "track"
     tracker: str = "rigid-bodies"
     """Name of an installed tracker."""
     options: Mapping[str, Any] = {}
@@ -92,7 +92,7 @@ def clip_of(record: QueriedDemo) -> Clip:
 class LiftStage(Stage, LiftSettings):
     """Tracks in the picture become tracks in the world, with what is known of their error."""
 
-    stage: Literal["lift"] = "lift"
+    stage: str = "lift"
 
     def process(self, record: TrackedDemo) -> Episode:
         """Lift the tracks by every frame's depth."""
@@ -104,7 +104,7 @@ class LiftStage(Stage, LiftSettings):
 class QualityStage(Stage):
     """Keeps out episodes whose tracks are too poor to learn from; they can still be looked at."""
 
-    stage: Literal["quality"] = "quality"
+    stage: str = "quality"
     sure_m: float = Field(default=0.05, gt=0)
     """A position counts as sure if the camera sees the point and its stated error is below this [m]."""
     min_sure_share: float = Field(default=0.25, ge=0, le=1)
