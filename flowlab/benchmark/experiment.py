@@ -9,7 +9,8 @@ from typing import Any
 
 from flowlab.benchmark.recipe import ExperimentRecipe, curve_trials, final_trials
 from flowlab.benchmark.results import read_result, unit_path, write_result
-from flowlab.benchmark.units import ExperimentUnit, plan_units
+from flowlab.benchmark.units import ExperimentUnit, plan_units, sampling_of
+from flowlab.data.settings import TrainSettings
 from flowlab.errors import DataError, UnfinishedError
 from flowlab.evaluation.checkpoints import find_checkpoints
 from flowlab.evaluation.evaluate import evaluate_here
@@ -18,7 +19,6 @@ from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.policies.checkpoint import RUN, newest_checkpoint, read_run_config, read_trained, step_of
-from flowlab.policies.settings import TrainSettings
 from flowlab.registry import ENGINES
 from flowlab.storage.manifest import differences
 from flowlab.training import run
@@ -136,7 +136,7 @@ def _extract(
         changes = [
             f"episodes={recipe.demonstrations + 1}",
             f"queries.points={recipe.query_points}",
-            f"queries.sampling={unit.settings.motion.sampling}",
+            f"queries.sampling={sampling_of(unit.settings)}",
         ]
         extract(load_recipe(recipe.recipe, changes), (unit.task,), out / folder, start_engine=start_engine)
 

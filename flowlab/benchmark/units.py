@@ -5,8 +5,9 @@ from collections import Counter
 
 from flowlab.benchmark.recipe import ExperimentRecipe, PolicyVariant, expand_tasks, final_trials
 from flowlab.config import Settings
+from flowlab.data.settings import TrainSettings
 from flowlab.errors import UsageError, unknown_name
-from flowlab.policies.settings import TrainSettings, load_settings
+from flowlab.policies.settings import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
 
 DATA = "data"
@@ -21,7 +22,7 @@ class ExperimentUnit(Settings):
     task: str
     dataset: str
     """Folder below the experiment's."""
-    settings: TrainSettings
+    settings: AnyTrainSettings
 
 
 def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
@@ -65,10 +66,10 @@ def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVaria
         *(variant.set if variant else ()),
     ]
     settings = load_settings(recipe.profile, policy, changes)
-    sampling, points = settings.motion.sampling, settings.motion.points
-    if policy == "fdp" and points > recipe.query_points:
+    flow, sampling = settings.needs.flow, sampling_of(settings)
+    if flow is not None and flow.points > recipe.query_points:
         raise UsageError(
-            f"experiment {recipe.name}: {task}-{label} wants {points} query points, and the datasets get "
+            f"experiment {recipe.name}: {task}-{label} wants {flow.points} query points, and the datasets get "
             f"{recipe.query_points}; raise query_points"
         )
     return ExperimentUnit(
@@ -78,3 +79,9 @@ def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVaria
         dataset=f"{DATA}/{task}" + ("" if sampling == "scene" else f"-{sampling}"),
         settings=settings,
     )
+
+
+def sampling_of(settings: TrainSettings) -> str:
+    """Which query points the dataset of a policy gets; a policy that follows none takes what there is for others."""
+    flow = settings.needs.flow
+    return "scene" if flow is None else flow.sampling

@@ -1,18 +1,30 @@
 """A policy's side of one episode: what it remembers, and what it has decided to do."""
 
 from collections import deque
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.errors import DataError
+from flowlab.errors import DataError, UsageError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.policies.base import ActionPlan, PolicySpec
 from flowlab.records import Frame, Queries
+
+_NO_POINTS = np.zeros((0, 3), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _ObservedStep:
+    """What a policy needs of one step; what it does not need is empty, or None."""
+
+    points: Float32[np.ndarray, "N 3"]
+    state: Float32[np.ndarray, "S"]
+    rgb: UInt8[np.ndarray, "H W 3"] | None
+    depth: Float32[np.ndarray, "H W"] | None
 
 
 class PolicyRunner:
@@ -23,7 +35,9 @@ class PolicyRunner:
     """
 
     def __init__(self, spec: PolicySpec, task: str, seed: int, n_action_steps: int | None = None) -> None:
-        if spec.observer is None:
+        needs = spec.settings.needs
+        self._needs_cloud = needs.point_cloud is not None or needs.flow is not None
+        if self._needs_cloud and spec.observer is None:
             raise DataError("the policy was trained on clouds whose making is not known, so nobody can make such again")
         s = spec.settings
         self.spec = spec
@@ -33,9 +47,9 @@ class PolicyRunner:
         """Where the noise of this episode's plans comes from."""
         self.queries: Queries | None = None
         """The points whose motion is predicted; None for policies that predict none."""
-        self._observer = Observer(ObserverSettings.model_validate(spec.observer), task)
+        self._observer = Observer(ObserverSettings.model_validate(spec.observer or {}), task)
         self._task = torch.tensor([spec.tasks.index(task)])
-        self._history: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=s.n_obs_steps)
+        self._history: deque[_ObservedStep] = deque(maxlen=s.n_obs_steps)
         self._actions: deque[np.ndarray] = deque()
 
     @property
@@ -52,29 +66,41 @@ class PolicyRunner:
         """Take in a step that a plan will be decided on.
 
         Args:
-            frame: What the camera sees: depth [m], and the camera's pose in the dataset's world frame.
+            frame: What the camera sees: depth [m], the camera's pose in the dataset's world frame, and color where the
+                policy needs it.
             state: The robot's, laid out as in the training data.
 
         Raises:
             DataError: The frame shows nothing.
+            UsageError: The policy needs color, and the frame has none.
         """
-        cloud = self._observer.cloud(frame)
-        points = self._observer.sample(cloud).points_world[: self.spec.settings.encoder.points]
-        first = not self._history
-        if first and self.spec.settings.policy == "fdp":
-            self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
+        needs, first = self.spec.settings.needs, not self._history
+        if needs.rgb and frame.rgb is None:
+            raise UsageError("the policy needs color, and the frame has none; give it as rgb, of the size of the depth")
+        points = _NO_POINTS
+        if self._needs_cloud:
+            cloud = self._observer.cloud(frame)
+            if needs.point_cloud is not None:
+                points = self._observer.sample(cloud).points_world[: needs.point_cloud.points]
+            if first and needs.flow is not None:
+                self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
+        rgb, depth = frame.rgb if needs.rgb else None, frame.depth if needs.depth else None
+        step = _ObservedStep(points, np.asarray(state, np.float32), rgb, depth)
         times = self.spec.settings.n_obs_steps if first else 1  # what was before the first step is taken to be like it
-        self._history.extend([(points, np.asarray(state, np.float32))] * times)
+        self._history.extend([step] * times)
 
     def observation(self) -> ObservationBatch:
         """What a plan is to be decided on, as one window."""
-        queries = np.zeros((0, 3), np.float32) if self.queries is None else self.queries.xyz_world
+        queries = _NO_POINTS if self.queries is None else self.queries.xyz_world
+        needs, steps = self.spec.settings.needs, self._history
         return ObservationBatch(
-            points=torch.from_numpy(np.stack([points for points, _ in self._history])),
-            state=torch.from_numpy(np.stack([state for _, state in self._history])),
-            observed=torch.arange(len(self._history))[None],
+            points=torch.from_numpy(np.stack([s.points for s in steps])),
+            state=torch.from_numpy(np.stack([s.state for s in steps])),
+            observed=torch.arange(len(steps))[None],
             queries=torch.from_numpy(queries)[None],
             task=self._task,
+            rgb=torch.from_numpy(np.stack([s.rgb for s in steps if s.rgb is not None])) if needs.rgb else None,
+            depth=torch.from_numpy(np.stack([s.depth for s in steps if s.depth is not None])) if needs.depth else None,
         )
 
     def execute(self, plan: ActionPlan, window: int = 0) -> None:
@@ -85,15 +111,3 @@ class PolicyRunner:
     def next_action(self) -> Float32[np.ndarray, "A"]:
         """The action of this step, in the dataset's units."""
         return self._actions.popleft()
-
-
-def concatenate(observations: Sequence[ObservationBatch]) -> ObservationBatch:
-    """Observations of one window each as one batch."""
-    frames = np.cumsum([0, *(len(o.points) for o in observations)])
-    return ObservationBatch(
-        points=torch.cat([o.points for o in observations]),
-        state=torch.cat([o.state for o in observations]),
-        observed=torch.cat([o.observed + int(n) for o, n in zip(observations, frames[:-1], strict=True)]),
-        queries=torch.cat([o.queries for o in observations]),
-        task=torch.cat([o.task for o in observations]),
-    )

@@ -33,8 +33,9 @@ class CheckpointRef:
 
     @property
     def scene(self) -> SceneSettings:
-        """The simulated scene that its policy knows."""
-        return SceneSettings.model_validate(self.trained.scene)
+        """The simulated scene that its policy knows, with color where the policy needs it."""
+        color = self.trained.policy.settings.needs.rgb
+        return SceneSettings.model_validate(self.trained.scene).model_copy(update={"rgb": color})
 
     def read_evaluation(self, trials: Sequence[Trial]) -> CheckpointEvaluation:
         """Those of the trials that have been tried."""
@@ -58,10 +59,15 @@ def find_checkpoint(path: Path, n_action_steps: int | None = None) -> Checkpoint
     run = weights.absolute().parents[1] if path.suffix == ".safetensors" else path
     trained = read_trained(run)
     s = trained.policy.settings
-    if trained.scene is None or trained.policy.observer is None:
+    if trained.scene is None or (trained.policy.observer is None and _needs_cloud(trained)):
         raise DataError(
             f"{path}: was trained on recordings or on a DP3 store ({trained.dataset}), so no simulation shows what it "
             f"knows; compare it with held-out demonstrations by 'flowlab eval {path} --offline'"
+        )
+    if s.needs.rgb and not trained.scene.get("rgb"):
+        raise DataError(
+            f"{path}: needs color, and the scene that it was trained in has none; train it on a dataset that was made "
+            "with --renderer gl --set expert.scene.rgb=true"
         )
     most = s.horizon - s.n_obs_steps + 1
     if n_action_steps is not None and not 1 <= n_action_steps <= most:
@@ -91,6 +97,11 @@ def common_tasks(checkpoints: Sequence[CheckpointRef], asked: Sequence[str] = ()
         each = "; ".join(f"{c.run} {', '.join(sorted(k))}" for c, k in zip(checkpoints, known, strict=True))
         raise UsageError(f"no task is common to all runs ({each}); evaluate them apart, or make one report of them")
     return tuple(dict.fromkeys(asked)) or tuple(sorted(common))
+
+
+def _needs_cloud(trained: TrainedPolicy) -> bool:
+    needs = trained.policy.settings.needs
+    return needs.point_cloud is not None or needs.flow is not None
 
 
 def read_evaluations(run: Path) -> list[CheckpointEvaluation]:

@@ -176,7 +176,7 @@ def _missing_batches(
             yield EpisodeBatch(
                 weights=checkpoint.weights,
                 episodes=checkpoint.episodes,
-                scene=checkpoint.scene.model_copy(update={"rgb": False}),
+                scene=checkpoint.scene,
                 n_action_steps=checkpoint.n_action_steps,
                 trials=tuple(of_task[first : first + size]),
                 device=device,

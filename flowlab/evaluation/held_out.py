@@ -35,10 +35,10 @@ def open_held_out(loaded: LoadedPolicy, data: Path | None = None) -> HeldOut:
     run = loaded.path.absolute().parents[1]
     source = _open_source(loaded, run, data)
     check_observer(loaded.trained, run, source)
-    buffer = load_buffer(source, run)
+    buffer = load_buffer(source, run, loaded.policy.needs.pictures)
     _check_fit(loaded.policy.spec, buffer, source.path)
     buffer = _select(buffer, _unseen(loaded, run, source, buffer))
-    return HeldOut(source.path, buffer, _cameras(source.path, buffer) if source.settings else None)
+    return HeldOut(source.path, buffer, _cameras(source.path, buffer) if source.provenance.kind != "imported" else None)
 
 
 def _open_source(loaded: LoadedPolicy, run: Path, data: Path | None) -> TrainingSource:
@@ -75,8 +75,10 @@ def _check_fit(spec: PolicySpec, buffer: ReplayBuffer, where: Path) -> None:
     ):
         if found != wanted:
             raise DataError(f"{where}: '{name}' is {found} wide, and {wanted} in what the policy was trained on")
-    if spec.settings.policy == "mba" and buffer.object_pose.shape[1] != 9:
-        raise DataError(f"{where}: has no object poses, which mba predicts; evaluate it on a dataset that has them")
+    if missing := spec.settings.needs.missing_from(buffer):
+        raise DataError(
+            f"{where}: has no {missing}, which {spec.settings.policy} needs; evaluate it on a dataset that has them"
+        )
     if not set(spec.tasks) & set(buffer.tasks):
         raise DataError(
             f"{where}: has the tasks {', '.join(buffer.tasks)}, and the policy was trained on {', '.join(spec.tasks)}"
@@ -94,8 +96,8 @@ def _unseen(loaded: LoadedPolicy, run: Path, source: TrainingSource, buffer: Rep
             "with --data"
         )
     known = _known_scenes(loaded.trained, run, source)
-    of_tasks = [k for k, d in enumerate(buffer.demos) if d.task in loaded.trained.policy.tasks]
-    if found := [k for k in of_tasks if (buffer.demos[k].task, buffer.demos[k].seed) not in known]:
+    of_tasks = [k for k, d in enumerate(buffer.episodes) if d.task in loaded.trained.policy.tasks]
+    if found := [k for k in of_tasks if (buffer.episodes[k].task, buffer.episodes[k].seed) not in known]:
         return found
     raise DataError(
         f"{source.path}: the policy was trained on the scenes of all its {len(of_tasks)} demonstrations; give a "
@@ -106,7 +108,7 @@ def _unseen(loaded: LoadedPolicy, run: Path, source: TrainingSource, buffer: Rep
 def _known_scenes(trained: TrainedPolicy, run: Path, source: TrainingSource) -> set[tuple[str, int]]:
     """Simulated scenes, by task and seed, that a policy was trained on and that another dataset may hold too."""
     planned = read_run_config(run) if (run / RUN).exists() else None
-    if "expert" in source.settings:
+    if source.provenance.is_simulated:
         scene_seeds = [(task, seed) for task in sorted(trained.scene_seeds) for seed in trained.scene_seeds[task]]
         return set([scene_seeds[k] for k in planned.train] if scene_seeds and planned is not None else scene_seeds)
     if planned is not None and source.path.resolve() == planned.dataset:
@@ -121,11 +123,11 @@ def _select(buffer: ReplayBuffer, demos: Sequence[int]) -> ReplayBuffer:
     """The buffer with some of its demonstrations."""
     names = ("queries", "query_role", "query_count")
     mine: dict[str, Any] = {name: getattr(buffer, name)[list(demos)] for name in names}
-    return replace(buffer, demos=tuple(buffer.demos[k] for k in demos), **mine)
+    return replace(buffer, episodes=tuple(buffer.episodes[k] for k in demos), **mine)
 
 
 def _cameras(path: Path, buffer: ReplayBuffer) -> tuple[Camera, ...]:
     """The camera of every demonstration: a simulated dataset's, or its recording's."""
     shards = {(r.task, r.seed): r.shard for r in Dataset(path).refs}
-    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.demos}}
-    return tuple(Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in buffer.demos)
+    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
+    return tuple(Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in buffer.episodes)

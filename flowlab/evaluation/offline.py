@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flowlab.config import Settings
-from flowlab.data.batches import BatchBuilder, WindowIndex, choose_queries, index_windows
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.query_points import choose_queries
+from flowlab.data.window_sampler import WindowIndex, index_windows
 from flowlab.evaluation.flow_metrics import FlowErrors, pool_errors
 from flowlab.evaluation.held_out import HeldOut, open_held_out
 from flowlab.evaluation.sampled_flow import FlowSampler
@@ -74,7 +76,7 @@ def evaluate_offline(loaded: LoadedPolicy, data: Path | None = None) -> OfflineR
     """
     held_out = open_held_out(loaded, data)
     evaluator = _OfflineEvaluator(loaded.policy, held_out)
-    each = [evaluator.measure(k) for k in range(len(held_out.buffer.demos))]
+    each = [evaluator.measure(k) for k in range(len(held_out.buffer.episodes))]
     return OfflineReport(
         policy=loaded.policy.spec.settings.policy,
         step=loaded.step,
@@ -95,12 +97,13 @@ class _OfflineEvaluator:
         s, spec = policy.spec.settings, policy.spec
         self._policy, self._held_out = policy, held_out
         self._builder = BatchBuilder(held_out.buffer, spec.channels, s, spec.tasks)
-        columns = choose_queries(held_out.buffer, s.motion) if s.policy == "fdp" else None
+        needs = policy.needs.flow
+        columns = None if needs is None else choose_queries(held_out.buffer, needs)
         self._sampler = None if columns is None else FlowSampler(policy, held_out.buffer, self._builder, columns)
 
     def measure(self, demo: int) -> DemonstrationErrors:
         """All errors on one demonstration."""
-        about = self._held_out.buffer.demos[demo]
+        about = self._held_out.buffer.episodes[demo]
         return DemonstrationErrors(
             task=about.task,
             seed=about.seed,

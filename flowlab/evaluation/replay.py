@@ -38,15 +38,14 @@ class ReplayedEpisode:
 def replay_episode(checkpoint: CheckpointRef, trial: Trial) -> ReplayedEpisode:
     """Let a policy try an episode again, which goes as it went before."""
     policy = load_policy(checkpoint.weights).policy
-    scene = checkpoint.scene.model_copy(update={"rgb": False})
-    simulators = SimulatorPool(trial.task, scene)
+    simulators = SimulatorPool(trial.task, checkpoint.scene)
     tried = next(roll_out(policy, simulators, [trial], n_action_steps=checkpoint.n_action_steps))
     observer = ObserverStage.model_validate({**(policy.spec.observer or {}), "stage": "observer"})
     observed = observer.process(tried.rollout)
     queries = tried.queries if tried.queries is not None else _would_be_queries(policy, observed)
     assert observed.owner is not None
     tracks = label(tried.rollout, queries, observed.depth, observed.owner, RigidFlowSettings())
-    demo = QueriedDemo(_with_large_pictures(observed, scene), queries)
+    demo = QueriedDemo(_with_large_pictures(observed, checkpoint.scene), queries)
     episode = labeled(demo, tracks, evaluated=tried.result.model_dump(mode="json"))
     return ReplayedEpisode(episode, _prediction(tried, tracks.xyz_world), tried.result)
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float32
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.deployment.runner import PolicyRunner, concatenate
+from flowlab.deployment.runner import PolicyRunner
 from flowlab.errors import DataError
 from flowlab.evaluation.flow_error import flow_error
 from flowlab.evaluation.results import EpisodeResult
@@ -105,7 +105,7 @@ def roll_out(
 def _observations(running: Mapping[int, "_RunningEpisode"]) -> ObservationBatch:
     """What a plan for all slots is decided on; those in which nothing runs show what another does."""
     spare = min(running)
-    return concatenate(
+    return ObservationBatch.concatenate(
         [running[slot if slot in running else spare].runner.observation() for slot in range(BATCH_SLOTS)]
     )
 

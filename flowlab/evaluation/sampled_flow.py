@@ -6,8 +6,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int
 
-from flowlab.data.batches import Batch, BatchBuilder, ObservationBatch, WindowIndex
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.data.window_sampler import WindowIndex
 from flowlab.evaluation.flow_metrics import PointStepErrors
 from flowlab.policies.base import PolicyNetwork
 from flowlab.training.validation import constant_motion, portions, true_motion
@@ -68,9 +70,9 @@ class FlowSampler:
         self, windows: WindowIndex, steps: int
     ) -> tuple[Float32[np.ndarray, "W K M 3"], Bool[np.ndarray, "W K M"]]:
         """Where the query points are after 1, 2, ... actions [m], and whether they are seen."""
-        stop = np.array([d.stop for d in self._buffer.demos])[windows.demo]
+        stop = np.array([d.stop for d in self._buffer.episodes])[windows.episode]
         row = np.minimum(windows.now[:, None] + np.arange(1, steps + 1), stop[:, None] - 1)
-        column = self._columns[windows.demo][:, None]
+        column = self._columns[windows.episode][:, None]
         return self._buffer.tracks[row[..., None], column], self._buffer.visible[row[..., None], column]
 
 
@@ -82,4 +84,6 @@ def _repeat(batch: Batch, times: int) -> ObservationBatch:
         observed=batch.observed.repeat(times, 1),
         queries=batch.queries.repeat(times, 1, 1),
         task=batch.task.repeat(times),
+        rgb=batch.rgb,
+        depth=batch.depth,
     )
