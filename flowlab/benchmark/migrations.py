@@ -3,10 +3,9 @@
 from typing import Any
 
 from flowlab.evaluation.migrations import migrate_episode, rename_keys
+from flowlab.policies.migrations import migrate_settings
 
 _EVALUATION = {"executed": "n_action_steps"}
-_SETTINGS = {"history": "n_obs_steps", "executed": "n_action_steps", "optimiser": "optimizer"}
-_MOTION = {"layout": "flow_representation"}
 
 
 def migrate_result(values: Any) -> Any:
@@ -19,14 +18,6 @@ def migrate_result(values: Any) -> Any:
     evaluations = values.get("evaluations")
     if isinstance(evaluations, list):
         values = {**values, "evaluations": [_migrate_evaluation(e) for e in evaluations]}
-    return values
-
-
-def migrate_settings(values: Any) -> Any:
-    """Settings of a training run under the names of today."""
-    values = rename_keys(values, _SETTINGS)
-    if isinstance(values, dict) and "motion" in values:
-        values = {**values, "motion": rename_keys(values["motion"], _MOTION)}
     return values
 
 

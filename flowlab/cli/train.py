@@ -12,6 +12,7 @@ from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
 if TYPE_CHECKING:
+    from flowlab.training.run import Precision
     from flowlab.training.train import TrainedRun
 
 
@@ -60,7 +61,7 @@ def train(
     resume: bool,
     device: str | None,
     threads: int | None,
-    precision: str | None,
+    precision: "Precision | None",
     logs: tuple[str, ...],
     as_json: bool,
 ) -> None:
@@ -92,29 +93,30 @@ def train(
     from flowlab.training import train as training
     from flowlab.training.distributed import is_first_process
 
-    asked: dict[str, Any] = {"device": device, "threads": threads, "precision": precision, "logs": logs or None}
     first = is_first_process()
     quiet = as_json or not first
     with ProgressBar(quiet, STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
-        asked |= {
-            "on_start": None if quiet else _say,
-            "on_progress": partial(show_training, bar),
-            "should_stop": should_stop,
-        }
-        given = {name: value for name, value in asked.items() if value is not None}
+        watch = training.Watch(_silent if quiet else _say, partial(show_training, bar), should_stop)
         if resume:
-            done = training.resume(source, **given)
+            done = training.resume(
+                source, device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
+            )
         else:
             assert policy is not None
             assert out is not None
             done = training.train(
                 source, out, policy=policy, profile=profile or "fast", minutes=minutes, settings=overrides, seed=seed,
-                overfit=overfit, began_from=began_from, **given,
+                overfit=overfit, began_from=began_from, device=device or "auto", threads=threads or 1,
+                precision=precision or "auto", logs=logs, watch=watch,
             )  # fmt: skip
     if first:
         _print(done, as_json)
     if not done.finished:
         sys.exit(130)
+
+
+def _silent(text: str) -> None:
+    """Not in JSON, nor in other processes than the first."""
 
 
 def _say(text: str) -> None:

@@ -56,7 +56,9 @@ class BatchBuilder:
             "queries": np.take_along_axis(buffer.queries, self._queries[:, query, None], 1)[windows.episode],
             "action": buffer.action[row],
             "flow": flow,
-            "object_pose": buffer.object_pose[row] if self._needs.object_pose else np.zeros((*row.shape, 0), np.float32),
+            "object_pose": buffer.object_pose[row]
+            if self._needs.object_pose
+            else np.zeros((*row.shape, 0), np.float32),
         }
         if rng is not None and (s.batch.shift_m or s.batch.turn_deg):
             self._move(arrays, windows, run_of_frame, rng)

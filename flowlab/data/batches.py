@@ -34,8 +34,8 @@ class ObservationBatch:
 
     def to(self, device: torch.device) -> Self:
         """The same on another device."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        moved = {k: v if v is None else v.to(device, non_blocking=True) for k, v in values.items()}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved: dict[str, Any] = {k: v if v is None else v.to(device, non_blocking=True) for k, v in values.items()}
         return type(self)(**moved)
 
     @classmethod
@@ -72,6 +72,8 @@ class Batch(ObservationBatch):
         if windows == slice(0, len(self.observed)):
             return self
         frame, observed = torch.unique(self.observed[windows], return_inverse=True)
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        mine = {k: v if v is None else v[frame if k in _OF_FRAMES else windows] for k, v in values.items()}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        mine: dict[str, Any] = {
+            k: v if v is None else v[frame if k in _OF_FRAMES else windows] for k, v in values.items()
+        }
         return Batch(**mine | {"observed": observed})

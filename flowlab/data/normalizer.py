@@ -69,9 +69,7 @@ def fit_normalizer(
     )
 
 
-def _isotropic(
-    scale: Scale, limits: tuple[Sequence[float], Sequence[float]], channels: tuple[int, int, int]
-) -> Scale:
+def _isotropic(scale: Scale, limits: tuple[Sequence[float], Sequence[float]], channels: tuple[int, int, int]) -> Scale:
     """A scale whose ``channels`` have one unit and no offset, so that a turned displacement is in range, too."""
     offset, unit = np.array(scale.offset), np.array(scale.unit)
     offset[list(channels)] = 0

@@ -231,9 +231,7 @@ class PerQueryFlowHead(MotionHead):
     ) -> None:
         super().__init__(settings, diffusion, clip)
         self.horizon = horizon
-        self.network = PointSetDenoiser(
-            settings.denoiser, horizon, settings.features, condition, diffusion.train_steps
-        )
+        self.network = PointSetDenoiser(settings.denoiser, horizon, settings.features, condition, diffusion.train_steps)
         if self.features:
             self.summary_layer = linear_layers([3 * horizon + settings.features, self.features, self.features])
             self.summary_output = nn.Linear(2 * self.features, self.features)

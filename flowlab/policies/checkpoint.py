@@ -258,4 +258,6 @@ def _validated(model: type[Model], path: Path) -> Model:
     except ValidationError as error:
         raise DataError(f"{path}: {explain(error, model)}") from error
     except UsageError as error:
-        raise DataError(f"{path}: {error}; install what has this policy, or put its module's folder on PYTHONPATH") from error
+        raise DataError(
+            f"{path}: {error}; install what has this policy, or put its module's folder on PYTHONPATH"
+        ) from error

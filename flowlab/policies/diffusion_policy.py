@@ -155,9 +155,7 @@ class DiffusionPolicy(PolicyNetwork):
             return None
         return context.state[context.observed[:, -1]][:, self.spec.channels.gripper]
 
-    def normalize_clouds(
-        self, points: Float[Tensor, "F N 3"], state: Float[Tensor, "F S"]
-    ) -> Float[Tensor, "F N 3"]:
+    def normalize_clouds(self, points: Float[Tensor, "F N 3"], state: Float[Tensor, "F S"]) -> Float[Tensor, "F N 3"]:
         """Clouds in normalized coordinates, relative to the gripper of the same frame where wanted."""
         return self.position_scale(points - state[:, None, self.spec.channels.gripper] if self.relative else points)
 

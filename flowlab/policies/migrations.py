@@ -7,12 +7,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from flowlab.storage.migrations import migrate_observer
+
 FORMAT = 2
 """Of ``policy.json`` and of files of weights."""
 _SETTINGS = {"history": "n_obs_steps", "executed": "n_action_steps", "optimiser": "optimizer"}
 _SPEC = {"normaliser": "normalizer", "layout": "channels"}
 _CHANNELS = {"state_places": "state_positions", "action_place": "action_position"}
-_OUTLIERS = {"neighbours": "neighbors", "deviations": "std_ratio"}
 _MOTION_OF_ALL = {"condition", "condition_noise", "weight", "features", "denoiser"}
 """Settings of a motion that every policy has which predicts one; the others were 3D FDP's alone."""
 _TENSORS = (
@@ -39,11 +40,11 @@ def migrate_policy(values: Any) -> Any:
         return values
     moved = _renamed(values, {"layouts": "scene_seeds"})
     spec = _renamed(values["policy"], _SPEC)
-    spec["settings"] = _settings(spec.get("settings"))
+    spec["settings"] = migrate_settings(spec.get("settings"))
     spec["channels"] = _renamed(spec.get("channels"), _CHANNELS)
     spec["normalizer"] = _normalizer(spec.get("normalizer"), spec["settings"])
     if isinstance(observer := spec.get("observer"), dict):
-        spec["observer"] = {**observer, "remove_outliers": _renamed(observer.get("remove_outliers"), _OUTLIERS)}
+        spec["observer"] = migrate_observer(dict(observer))
     return {**moved, "format": FORMAT, "policy": spec}
 
 
@@ -60,7 +61,7 @@ def _renamed(values: Any, names: Mapping[str, str]) -> Any:
     return {names.get(k, k): v for k, v in values.items()} if isinstance(values, dict) else values
 
 
-def _settings(values: Any) -> Any:
+def migrate_settings(values: Any) -> Any:
     """Each policy's own: a motion was among the settings of all of them."""
     if not isinstance(values, dict):
         return values

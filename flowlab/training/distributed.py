@@ -124,7 +124,7 @@ def has_bf16(device: torch.device) -> bool:
 
 
 def _reuse_freed_memory() -> None:
-    """Have glibc reuse what is freed: else it hands every large array back and gets it anew, page by page, in each step.
+    """Have glibc reuse what is freed: else it hands every large array back and gets it anew in each step.
 
     A tenth of a training step's time. Elsewhere than on glibc nothing happens.
     """

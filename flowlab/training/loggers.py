@@ -13,6 +13,7 @@ from flowlab.registry import LOGGERS
 class MetricsLogger(ABC):
     """Takes named numbers, step by step. Offered under an entry point of group ``flowlab.loggers``."""
 
+    @abstractmethod
     def __init__(self, folder: Path, run: str, settings: Mapping[str, Any]) -> None:
         """Begin, or go on where a run that is resumed was.
 

@@ -53,6 +53,26 @@ class TrainedRun:
         }
 
 
+def _ignore(_: object) -> None:
+    """Nobody wants to know."""
+
+
+def _never() -> bool:
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Who looks on while a run goes."""
+
+    on_start: Callable[[str], None] = _ignore
+    """Is told in words what was found and what will be done."""
+    on_progress: Callable[[TrainingProgress], None] = _ignore
+    """Is told how far the run is, every fifty steps."""
+    should_stop: Callable[[], bool] = _never
+    """Asked after every step whether to stop, as one that can be resumed."""
+
+
 def train(
     data: Path | str,
     out: Path | str,
@@ -68,9 +88,7 @@ def train(
     threads: int = 1,
     precision: Precision = "auto",
     logs: Sequence[str] = (),
-    on_start: Callable[[str], None] = lambda text: None,
-    on_progress: Callable[[TrainingProgress], None] = lambda progress: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    watch: Watch = Watch(),
 ) -> TrainedRun:
     """Train a policy on a dataset.
 
@@ -91,9 +109,7 @@ def train(
         threads: CPU threads of each process.
         precision: ``fp32`` or ``bf16``; ``auto`` is bf16 where the device has units for it.
         logs: Where else metrics go: ``tensorboard``, ``wandb``, what an installed package offers, or ``module:Class``.
-        on_start: Is told in words what was found and what will be done.
-        on_progress: Is told how far the run is, every fifty steps.
-        should_stop: Asked after every step whether to stop, as one to be resumed.
+        watch: Is told of the run as it goes, and may stop it.
 
     Returns:
         The run, of which ``folder`` is what :class:`flowlab.Policy` loads.
@@ -111,7 +127,7 @@ def train(
     compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
     began = None if began_from is None else Path(began_from)
     trainer = prepare_run(Path(data), Path(out), chosen, compute, overfit=overfit, began_from=began)
-    return _run(trainer, on_start, on_progress, should_stop)
+    return _run(trainer, watch)
 
 
 def resume(
@@ -121,9 +137,7 @@ def resume(
     threads: int | None = None,
     precision: Precision | None = None,
     logs: Sequence[str] | None = None,
-    on_start: Callable[[str], None] = lambda text: None,
-    on_progress: Callable[[TrainingProgress], None] = lambda progress: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    watch: Watch = Watch(),
 ) -> TrainedRun:
     """Go on with a run that ended early, as if it had never stopped.
 
@@ -132,7 +146,7 @@ def resume(
     if logs is not None:
         check_loggers(tuple(logs), Path.cwd())
     trainer = resume_run(Path(folder), device=device, threads=threads, precision=precision, logs=logs)
-    return _run(trainer, on_start, on_progress, should_stop)
+    return _run(trainer, watch)
 
 
 @contextmanager
@@ -153,17 +167,12 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _run(
-    trainer: Trainer,
-    on_start: Callable[[str], None],
-    on_progress: Callable[[TrainingProgress], None],
-    should_stop: Callable[[], bool],
-) -> TrainedRun:
+def _run(trainer: Trainer, watch: Watch) -> TrainedRun:
     first, metrics = trainer.processes.is_first, trainer.folder / METRICS
     if first:
         for text in _describe(trainer):
-            on_start(text)
-    finished = run(trainer, on_progress, should_stop)
+            watch.on_start(text)
+    finished = run(trainer, watch.on_progress, watch.should_stop)
     found = TrainedRun(
         folder=trainer.folder,
         policy=trainer.settings.policy,

@@ -21,7 +21,8 @@ from flowlab.benchmark.results import Evaluation, PolicyResult, TrainingRecord
 from flowlab.benchmark.robot_trials import RobotTrial
 from flowlab.benchmark.summary import ALL, pool_flow, summarize
 from flowlab.errors import DataError
-from flowlab.evaluation.trials import EpisodeResult, RolloutFlowError, Trial
+from flowlab.evaluation.results import EpisodeResult, RolloutFlowError
+from flowlab.evaluation.trials import Trial
 from flowlab.report.html import success_panels, success_rows, write_report
 
 SETTINGS: dict[str, Any] = {

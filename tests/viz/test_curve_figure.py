@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from flowlab.errors import DataError
-from flowlab.viz.curve_figure import compose, draw_curve, read_metrics
+from flowlab.viz.training_figure import compose, draw_curve, read_metrics
 
 ACTION = {"action_l1": 0.1, "action_l1_zero": 0.4, "action_l1_hold": 0.15}
 FLOW = {

@@ -30,7 +30,7 @@ from flowlab.viz.captions import caption, describe, moving
 from flowlab.viz.colors import ROLE_RGB, UNKNOWN, cloud_rgb_at, sigma_rgb
 from flowlab.viz.recording import TRAIL_STEPS, write_rrd
 from flowlab.viz.still import TIME_COLORS, compose, draw_still
-from flowlab.viz.upright import up_from_world
+from flowlab.viz.orientation import up_from_world
 
 T, P, M, DISTINCT_POINTS, DISTINCT_QUERIES = 30, 50, 8, 40, 6
 FAR = 99.0
