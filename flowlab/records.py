@@ -87,6 +87,9 @@ class Queries:
     count: int
     """How many are distinct; the rest repeat them."""
     entities: tuple[Entity, ...] = ()
+    pixel: Int32[np.ndarray, "M"] | None = None
+    """Flat index ``v * W + u`` of each point's pixel in the first frame; None where it is not known, as in episodes
+    that were stored."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,16 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from jaxtyping import Float32
 from pydantic import Field, model_validator
 
 from flowlab.errors import DataError
+from flowlab.geometry.camera import Camera
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.shared import ObserverStage, QueriesStage, WriteStage, labeled
 from flowlab.provenance import Provenance
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
-from flowlab.records import Clip, Episode, QueriedDemo, TrackedDemo
+from flowlab.records import Clip, Episode, QueriedDemo, Queries, TrackedDemo
 from flowlab.tracking.base import make_tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
 from flowlab.tracking.labeling import to_3d
@@ -71,14 +73,20 @@ class TrackStage(Stage):
         """Follow the points from their pixels in the first frame."""
         clip = clip_of(record)
         tracker = make_tracker(self.tracker, self.options)
-        pixel, _ = clip.camera.project(record.queries.xyz_world.astype(np.float64))
-        # The points came from pixels, and rounding finds these again exactly.
-        tracks = follow(clip, np.rint(pixel).astype(np.float32), tracker, self.chunks)
+        tracks = follow(clip, _first_pixels(record.queries, clip.camera), tracker, self.chunks)
         return TrackedDemo(record, tracks, tracker.describe())
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:
         """The tracks are estimated."""
         return provenance.model_copy(update={"tracks": "estimated", "tracker": self.tracker})
+
+
+def _first_pixels(queries: Queries, camera: Camera) -> Float32[np.ndarray, "M 2"]:
+    """Where the queries are in the first picture (x, y): in the pixels they come from, as far as that is known."""
+    if queries.pixel is None:
+        return camera.project(queries.xyz_world.astype(np.float64))[0].astype(np.float32)
+    v, u = np.divmod(queries.pixel, camera.width)
+    return np.stack([u, v], -1).astype(np.float32)
 
 
 def clip_of(record: QueriedDemo) -> Clip:

@@ -32,7 +32,7 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
         state=demo.state,
         action=demo.action,
         success=demo.success,
-        queries=record.queries,
+        queries=replace(record.queries, pixel=None),
         tracks=tracks,
         object_pose=demo.object_pose,
         depth=seen.depth,
