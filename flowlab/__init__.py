@@ -8,14 +8,16 @@ from flowlab.version import __version__
 if TYPE_CHECKING:
     from flowlab import data
     from flowlab.deployment.policy import Policy
+    from flowlab.evaluation.evaluate import evaluate
     from flowlab.training.train import TrainedRun, train
 
-__all__ = ["Policy", "TrainedRun", "__version__", "data", "train"]
+__all__ = ["Policy", "TrainedRun", "__version__", "data", "evaluate", "train"]
 
 _LAZY = {
     "Policy": "flowlab.deployment.policy",
     "TrainedRun": "flowlab.training.train",
     "data": "flowlab",
+    "evaluate": "flowlab.evaluation.evaluate",
     "train": "flowlab.training.train",
 }
 """Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flowlab.engines.local import StartEngine
+from flowlab.engines.base import StartEngine
 from flowlab.errors import DataError, UsageError
 from flowlab.pipeline.extraction import fill
 from flowlab.pipeline.recipe import Recipe

@@ -1,20 +1,29 @@
-"""A training run as one picture: losses, errors on held-out demonstrations beside what costs nothing, learning rate."""
+"""A training run as one picture: losses, learning rate, errors on held-out demonstrations beside baselines."""
 
-import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from flowlab.errors import DataError
-from flowlab.files import temporary_path
+from flowlab.viz.plot_style import (
+    BLUE,
+    DPI,
+    GRAY,
+    PINK,
+    PURPLE,
+    QUIET,
+    SERIES,
+    TICK_PT,
+    new_figure,
+    save_png,
+    set_title,
+    style_axes,
+)
+from flowlab.viz.training_metrics import MetricsLine, lines_of_kind, read_metrics, series
 
 LOSSES = {"loss": "total", "action_loss": "action", "motion_loss": "motion"}
 """What training lines say, and how it is labeled."""
@@ -46,25 +55,13 @@ COLUMNS = (
 FAR = 2.0
 """A baseline more than so many times as high as the rest is not drawn: its label alone says how bad it is."""
 
-_COLORS = ("#2a6fbb", "#e07b1a", "#2f9e6e")
-_POLICY, _BASELINES = "#2a6fbb", {"zero": "#6d737c", "hold": "#b8438a", "constant": "#7b5bb8"}
-_INK, _QUIET, _GRID = "#22262c", "#747b85", "#e6e8ec"
-_DPI, _HEIGHT_IN, _PANEL_IN, _LABELS_IN = 150, 4.9, 2.9, 1.5
+_BASELINE_COLORS = {"zero": GRAY, "hold": PINK, "constant": PURPLE}
+_HEIGHT_IN, _PANEL_IN, _LABELS_IN = 4.9, 2.9, 1.5
 _LEFT_IN, _TOP_IN, _BOTTOM_IN = 0.65, 1.0, 0.55
-_LABEL_PT = 8.5
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """A line of ``metrics.jsonl``."""
-
-    kind: str
-    step: int
-    values: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class End:
+class LineEnd:
     """What stands right of a panel, where a line ends."""
 
     height: float
@@ -73,60 +70,25 @@ class End:
     color: str
 
 
-Series = tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]
-"""Steps, and the value at each."""
-
-
-def draw_curve(metrics: Path, png: Path) -> None:
+def draw_training(metrics: Path, png: Path) -> None:
     """Write a PNG of a training run's ``metrics.jsonl``. ``png`` is either absent, as before, or whole.
 
-    Raises :class:`DataError` where there is nothing to draw, or a line is damaged; the last line may be cut off.
+    Raises:
+        DataError: There is nothing to draw, or a line is damaged; the last line may be cut off.
     """
-    temporary = temporary_path(png)
-    figure = compose(read_metrics(metrics), metrics.absolute().parent.name)
-    png.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        figure.savefig(temporary, format="png", facecolor="white")
-        os.replace(temporary, png)
-    finally:
-        temporary.unlink(missing_ok=True)
+    save_png(plot_training(read_metrics(metrics), metrics.absolute().parent.name), png)
 
 
-def read_metrics(path: Path) -> list[Line]:
-    """The lines of a run's metrics, at least one. A last line that a kill cut off is left out."""
-    try:
-        *whole, _ = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); a training run writes it") from error
-    lines = [_parse(path, number, text) for number, text in enumerate(whole, 1)]
-    if not lines:
-        raise DataError(f"{path}: holds no whole line yet; a training run adds the first after some steps")
-    return lines
-
-
-def _parse(path: Path, number: int, text: bytes) -> Line:
-    try:
-        values = json.loads(text)
-        kind, step = str(values.pop("kind")), int(values.pop("step"))
-        return Line(kind, step, {name: float(value) for name, value in values.items()})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DataError(
-            f"{path}: line {number} is damaged (expected a JSON object of numbers with kind and step, found "
-            f"{text[:60].decode(errors='replace')!r}); delete the line"
-        ) from error
-
-
-def compose(lines: Sequence[Line], title: str) -> Figure:
-    """The figure of :func:`draw_curve`: a column for training, if lines tell of it, and for each of :data:`COLUMNS`
+def plot_training(lines: Sequence[MetricsLine], title: str) -> Figure:
+    """The figure of :func:`draw_training`: a column for training, if lines tell of it, and for each of :data:`COLUMNS`
     that validation lines tell of."""
-    training = _only(lines, "train")
-    validation = _only(lines, "validation")
-    told = {name for line in validation for name in line.values}
-    columns = [[p for p in column if p.key in told] for column in COLUMNS]
+    training = lines_of_kind(lines, "train")
+    validation = lines_of_kind(lines, "validation")
+    known = {name for line in validation for name in line.values}
+    columns = [[p for p in column if p.key in known] for column in COLUMNS]
     columns = [column for column in columns if column]
     count = max(len(columns) + bool(training), 1)
-    figure = Figure(figsize=(count * (_LEFT_IN + _PANEL_IN + _LABELS_IN), _HEIGHT_IN), dpi=_DPI)
-    FigureCanvasAgg(figure)
+    figure = new_figure(count * (_LEFT_IN + _PANEL_IN + _LABELS_IN), _HEIGHT_IN)
     last_step = max(line.step for line in lines)
     if training:
         losses, rate = _make_axes(figure, 0, count, (3.2, 1))
@@ -138,34 +100,23 @@ def compose(lines: Sequence[Line], title: str) -> Figure:
     for axes in figure.axes:
         _draw_steps(axes, last_step)
     width, height = figure.get_size_inches()
-    figure.text(0.15 / width, 1 - 0.33 / height, title, fontsize=15, weight="bold", color=_INK, va="center")
-    figure.text(0.15 / width, 1 - 0.6 / height, _about(lines), fontsize=9, color=_QUIET, va="center")
+    set_title(figure, title)
+    figure.text(0.15 / width, 1 - 0.6 / height, _describe_run(lines), fontsize=9, color=QUIET, va="center")
     return figure
 
 
-def _only(lines: Sequence[Line], kind: str) -> list[Line]:
-    return [line for line in lines if line.kind == kind]
-
-
-def _series(lines: Sequence[Line], name: str) -> Series:
-    """Steps and values of the lines that tell the value."""
-    pairs = [(line.step, line.values[name]) for line in lines if name in line.values]
-    steps, values = np.array(pairs, float).reshape(-1, 2).T
-    return steps, values
-
-
-def _about(lines: Sequence[Line]) -> str:
+def _describe_run(lines: Sequence[MetricsLine]) -> str:
     """How long the run has taken so far, and how fast it was."""
     last = lines[-1].values
-    facts = [f"{max(line.step for line in lines):,} steps".replace(",", " ")]
+    parts = [f"{max(line.step for line in lines):,} steps".replace(",", " ")]
     for name, what in (("cpu_s", "of CPU time"), ("wall_s", "by the clock")):
         if name in last:
             minutes = last[name] / 60
-            facts.append(f"{minutes:.1f} min {what}" if minutes >= 2 else f"{last[name]:.0f} s {what}")
-    _, rates = _series(lines, "samples_per_s")
+            parts.append(f"{minutes:.1f} min {what}" if minutes >= 2 else f"{last[name]:.0f} s {what}")
+    _, rates = series(lines, "samples_per_s")
     if len(rates):
-        facts.append(f"{np.median(rates):,.0f} samples/s".replace(",", " "))
-    return "   ·   ".join(facts)
+        parts.append(f"{np.median(rates):,.0f} samples/s".replace(",", " "))
+    return "   ·   ".join(parts)
 
 
 def _make_axes(figure: Figure, column: int, columns: int, heights: Sequence[float]) -> list[Axes]:
@@ -179,15 +130,15 @@ def _make_axes(figure: Figure, column: int, columns: int, heights: Sequence[floa
     return [figure.add_subplot(grid[k]) for k in range(len(heights))]
 
 
-def _draw_losses(axes: Axes, training: Sequence[Line]) -> None:
-    told = [name for name in LOSSES if any(name in line.values for line in training)]
-    if "motion_loss" not in told:
-        told = told[:1]  # the loss is the action's
+def _draw_losses(axes: Axes, training: Sequence[MetricsLine]) -> None:
+    known = [name for name in LOSSES if any(name in line.values for line in training)]
+    if "motion_loss" not in known:
+        known = known[:1]  # the loss is the action's
     ends = []
-    for name, color in zip(told, _COLORS, strict=False):
-        steps, values = _series(training, name)
+    for name, color in zip(known, SERIES, strict=False):
+        steps, values = series(training, name)
         _plot(axes, steps, values, color)
-        ends.append(End(values[-1], f"{LOSSES[name]} {values[-1]:.3g}", color))
+        ends.append(LineEnd(values[-1], f"{LOSSES[name]} {values[-1]:.3g}", color))
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
@@ -196,9 +147,9 @@ def _draw_losses(axes: Axes, training: Sequence[Line]) -> None:
     _label_ends(axes, ends)
 
 
-def _draw_rate(axes: Axes, training: Sequence[Line]) -> None:
-    steps, values = _series(training, "lr")
-    _plot(axes, steps, values, _QUIET)
+def _draw_rate(axes: Axes, training: Sequence[MetricsLine]) -> None:
+    steps, values = series(training, "lr")
+    _plot(axes, steps, values, QUIET)
     highest = float(values.max(initial=0))
     axes.set_ylim(0, 1.1 * highest or 1)
     axes.set_yticks([0, highest], ["0", f"{highest:.3g}"])
@@ -211,22 +162,22 @@ def _plot(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str) -> None
     axes.plot(steps, values, color=color, linewidth=1.4, marker=marker, markersize=3.5, zorder=3, clip_on=False)
 
 
-def _draw_errors(axes: Axes, panel: CurvePanel, validation: Sequence[Line]) -> None:
+def _draw_errors(axes: Axes, panel: CurvePanel, validation: Sequence[MetricsLine]) -> None:
     """The policy's error at every look, and dashed what its baselines have."""
-    steps, values = _series(validation, panel.key)
-    found = {s: _series(validation, f"{panel.key}_{s}")[1] for s in panel.baselines}
+    steps, values = series(validation, panel.key)
+    found = {s: series(validation, f"{panel.key}_{s}")[1] for s in panel.baselines}
     baselines = {suffix: float(v[-1]) for suffix, v in found.items() if len(v)}
     rest = max([*values, *sorted(baselines.values())[:1]])
     top = 1.1 * max([rest, *(v for v in baselines.values() if v <= FAR * rest)]) or 1.0
-    axes.plot(steps, values, color=_POLICY, linewidth=1.8, marker="o", markersize=3.5, zorder=4, clip_on=False)
-    ends = [End(values[-1], f"policy {values[-1]:.3g}", _POLICY)]
+    axes.plot(steps, values, color=BLUE, linewidth=1.8, marker="o", markersize=3.5, zorder=4, clip_on=False)
+    ends = [LineEnd(values[-1], f"policy {values[-1]:.3g}", BLUE)]
     for suffix, value in baselines.items():
-        text, color = f"{panel.baselines[suffix]} {value:.3g}", _BASELINES[suffix]
+        text, color = f"{panel.baselines[suffix]} {value:.3g}", _BASELINE_COLORS[suffix]
         if value > FAR * rest:
-            ends.append(End(top, f"{text} ↑", color))
+            ends.append(LineEnd(top, f"{text} ↑", color))
             continue
         axes.axhline(value, color=color, linewidth=1.2, linestyle=(0, (4, 3)), zorder=2)
-        ends.append(End(value, text, color))
+        ends.append(LineEnd(value, text, color))
     axes.set_ylim(0, top)
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     style_axes(axes, panel.heading, panel.unit)
@@ -241,18 +192,18 @@ def _draw_steps(axes: Axes, last_step: int) -> None:
     spec = axes.get_subplotspec()
     assert spec is not None
     if spec.is_last_row():
-        axes.set_xlabel("training step", color=_QUIET, fontsize=9)
+        axes.set_xlabel("training step", color=QUIET, fontsize=9)
 
 
-def _label_ends(axes: Axes, ends: Sequence[End]) -> None:
+def _label_ends(axes: Axes, ends: Sequence[LineEnd]) -> None:
     """Name lines right of the panel, each where it ends, or as near as the others allow."""
-    gap = 1.3 * _LABEL_PT * _DPI / 72 / axes.get_window_extent().height
+    gap = 1.3 * TICK_PT * DPI / 72 / axes.get_window_extent().height
     ordered = sorted(ends, key=lambda end: end.height)
     to_share = axes.transData + axes.transAxes.inverted()
     wanted = [float(to_share.transform((0, end.height))[1]) for end in ordered]
     for place, end in zip(_spread(wanted, gap), ordered, strict=True):
         axes.text(
-            1.03, place, end.text, transform=axes.transAxes, fontsize=_LABEL_PT, color=end.color,
+            1.03, place, end.text, transform=axes.transAxes, fontsize=TICK_PT, color=end.color,
             va="center_baseline",
         )  # fmt: skip
 
@@ -267,14 +218,3 @@ def _spread(wanted: Sequence[float], gap: float) -> list[float]:
     for k in reversed(range(len(places) - 1)):
         places[k] = min(places[k], places[k + 1] - gap)
     return places
-
-
-def style_axes(axes: Axes, heading: str, ylabel: str = "") -> None:
-    """A panel's grid, ticks and heading."""
-    axes.grid(color=_GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(length=0, which="both", labelsize=8.5, labelcolor=_QUIET)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    axes.set_title(heading, loc="left", fontsize=10.5, color=_INK, pad=8)
-    axes.set_ylabel(ylabel, color=_QUIET, fontsize=9)

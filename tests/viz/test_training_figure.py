@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from flowlab.errors import DataError
-from flowlab.viz.curve_figure import compose, draw_curve, read_metrics
+from flowlab.viz.training_figure import draw_training, plot_training
+from flowlab.viz.training_metrics import read_metrics
 
 ACTION = {"action_l1": 0.1, "action_l1_zero": 0.4, "action_l1_hold": 0.15}
 FLOW = {
@@ -46,7 +47,7 @@ def write(path: Path, lines: Sequence[dict[str, Any]]) -> Path:
 
 def draw(tmp_path: Path, lines: Sequence[dict[str, Any]]) -> dict[str, Axes]:
     """The panels by heading."""
-    figure = compose(read_metrics(write(tmp_path / "metrics.jsonl", lines)), "run")
+    figure = plot_training(read_metrics(write(tmp_path / "metrics.jsonl", lines)), "run")
     return {axes.get_title(loc="left"): axes for axes in figure.axes}
 
 
@@ -147,9 +148,9 @@ def test_a_run_of_one_line_can_be_seen(tmp_path: Path) -> None:
 
 def test_the_picture_says_what_the_run_took(tmp_path: Path) -> None:
     lines = read_metrics(write(tmp_path / "m.jsonl", make_lines(ACTION)))
-    words = {text.get_text() for text in compose(lines, "my run").texts}
+    words = {text.get_text() for text in plot_training(lines, "my run").texts}
     assert words == {"my run", "1 000 steps   ·   5.0 min of CPU time   ·   10.0 min by the clock   ·   500 samples/s"}
-    words = {text.get_text() for text in compose(lines[:2], "my run").texts}
+    words = {text.get_text() for text in plot_training(lines[:2], "my run").texts}
     assert "100 steps   ·   30 s of CPU time   ·   60 s by the clock   ·   500 samples/s" in words
 
 
@@ -172,7 +173,7 @@ def test_a_damaged_line_is_named(tmp_path: Path, damage: str) -> None:
     lines[3] = damage
     metrics.write_text("\n".join(lines))
     with pytest.raises(DataError, match=f"^{metrics}: line 4 is damaged .*; delete the line$"):
-        draw_curve(metrics, tmp_path / "curve.png")
+        draw_training(metrics, tmp_path / "curve.png")
     assert [f.name for f in tmp_path.iterdir()] == ["metrics.jsonl"]
 
 
@@ -185,16 +186,16 @@ def test_bytes_that_are_no_text_are_damage(tmp_path: Path) -> None:
 
 def test_a_run_without_metrics_is_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no\.jsonl: cannot be read \(No such file"):
-        draw_curve(tmp_path / "no.jsonl", tmp_path / "curve.png")
+        draw_training(tmp_path / "no.jsonl", tmp_path / "curve.png")
     (tmp_path / "cut.jsonl").write_text('{"kind": "tr')
     with pytest.raises(DataError, match=r"cut\.jsonl: holds no whole line yet"):
-        draw_curve(tmp_path / "cut.jsonl", tmp_path / "curve.png")
+        draw_training(tmp_path / "cut.jsonl", tmp_path / "curve.png")
 
 
 def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     metrics = write(tmp_path / "push-fdp" / "metrics.jsonl", make_lines(ACTION | FLOW))
     path = tmp_path / "deeper" / "curve.png"
-    draw_curve(metrics, path)
+    draw_training(metrics, path)
     picture = imread(path)
     assert picture.shape[1] > 2.5 * picture.shape[0]
     assert picture[..., :3].min() < 0.5
@@ -205,6 +206,6 @@ def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("os.replace", fails)
     with pytest.raises(OSError, match="no space"):
-        draw_curve(metrics, path)
+        draw_training(metrics, path)
     assert path.read_bytes() == before
     assert [f.name for f in path.parent.iterdir()] == ["curve.png"]

@@ -11,19 +11,10 @@ from matplotlib.image import imread
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from flowlab.viz.success_figure import (
-    FlowBars,
-    LearningCurve,
-    Mark,
-    SuccessPanel,
-    compose_curves,
-    compose_flow,
-    compose_success,
-    draw_curves,
-    draw_flow,
-    draw_success,
-    policy_colors,
-)
+from flowlab.viz.flow_error_figure import FlowBars, draw_flow_errors, plot_flow_errors
+from flowlab.viz.learning_curve_figure import LearningCurve, draw_learning_curves, plot_learning_curves
+from flowlab.viz.plot_style import policy_colors
+from flowlab.viz.success_figure import Mark, SuccessPanel, draw_success, plot_success
 
 A, B = Mark(0.4, 0.2, 0.6), Mark(0.9, 0.7, 0.95, paper=0.5)
 HARD = SuccessPanel("hard (2 of 6)", {"push": {"dp3": A, "fdp": B}, "assembly": {"fdp": A}}, {"dp3": A})
@@ -69,7 +60,7 @@ def inside(figure: Figure) -> None:
 
 
 def test_every_policy_has_its_dot_interval_and_diamond() -> None:
-    figure = compose_success([EASY, HARD], ["dp3", "fdp"])
+    figure = plot_success([EASY, HARD], ["dp3", "fdp"])
     inside(figure)
     assert list(titles(figure)) == ["easy (1 of 28)", "hard (2 of 6)"]
     hard = titles(figure)["hard (2 of 6)"]
@@ -87,7 +78,7 @@ def test_every_policy_has_its_dot_interval_and_diamond() -> None:
 
 
 def test_rows_have_room_for_their_policies_and_names_are_in_their_middle() -> None:
-    hard = titles(compose_success([HARD], ["dp3", "fdp"]))["hard (2 of 6)"]
+    hard = titles(plot_success([HARD], ["dp3", "fdp"]))["hard (2 of 6)"]
     push, assembly, mean = (float(y) for y in hard.get_yticks())
     heights = [y for _, y, _ in drawn(hard, "o")]
     assert heights == sorted(set(heights))
@@ -97,7 +88,7 @@ def test_rows_have_room_for_their_policies_and_names_are_in_their_middle() -> No
 
 
 def test_the_paper_is_in_the_legend_only_if_it_is_drawn() -> None:
-    assert legend(compose_success([EASY], ["dp3"])) == ["dp3"]
+    assert legend(plot_success([EASY], ["dp3"])) == ["dp3"]
 
 
 def test_many_tasks_are_set_in_two_columns() -> None:
@@ -105,7 +96,7 @@ def test_many_tasks_are_set_in_two_columns() -> None:
         return SuccessPanel(f"{count}", {f"task-{k}": {"dp3": A, "fdp": B} for k in range(count)}, {})
 
     def left(*counts: int) -> list[float]:
-        figure = compose_success([panel(n) for n in counts], ["dp3", "fdp"])
+        figure = plot_success([panel(n) for n in counts], ["dp3", "fdp"])
         inside(figure)
         return [axes.get_position().x0 for axes in figure.axes]
 
@@ -117,10 +108,10 @@ def test_many_tasks_are_set_in_two_columns() -> None:
 
 def test_long_names_have_room() -> None:
     task, label = "button-press-topdown-wall", "a-run-of-last-november-with-seed-3"
-    inside(compose_success([SuccessPanel("easy", {task: {label: A, "fdp": B}}, {})], [label, "fdp"]))
-    inside(compose_flow({task: {label: FlowBars(4, 20, 7, 40)}}, [label]))
+    inside(plot_success([SuccessPanel("easy", {task: {label: A, "fdp": B}}, {})], [label, "fdp"]))
+    inside(plot_flow_errors({task: {label: FlowBars(4, 20, 7, 40)}}, [label]))
     inside(
-        compose_curves(
+        plot_learning_curves(
             {task: {f"{label}-{k}": LearningCurve((1, 2), (A, B)) for k in range(4)}},
             [f"{label}-{k}" for k in range(4)],
         )
@@ -132,11 +123,11 @@ def test_colors_tell_policies_apart() -> None:
     colors = policy_colors([*known, "mine", "yours"])
     assert len(set(colors.values())) == 10
     assert policy_colors(["fdp"]) == {"fdp": colors["fdp"]}
-    assert len(policy_colors([f"run-{k}" for k in range(30)])) == 30
+    assert len(set(policy_colors([f"run-{k}" for k in range(30)]).values())) == 30, "each has one of its own"
 
 
 def test_curves_are_drawn_task_by_task() -> None:
-    figure = compose_curves(CURVES, ["dp3", "mba", "fdp"])
+    figure = plot_learning_curves(CURVES, ["dp3", "mba", "fdp"])
     inside(figure)
     assert list(titles(figure)) == ["push", "assembly"]
     push, assembly = figure.axes
@@ -150,14 +141,14 @@ def test_curves_are_drawn_task_by_task() -> None:
 
 
 def test_axes_are_named_below_the_lowest_panels() -> None:
-    figure = compose_curves({f"task-{k}": {"fdp": LearningCurve((1, 2), (A, B))} for k in range(5)}, ["fdp"])
+    figure = plot_learning_curves({f"task-{k}": {"fdp": LearningCurve((1, 2), (A, B))} for k in range(5)}, ["fdp"])
     inside(figure)
     assert [bool(axes.get_xlabel()) for axes in figure.axes] == [False, False, True, True, True]
 
 
 def test_bars_of_flow_stand_before_those_of_no_motion() -> None:
     labels = ["dp3", "fdp", "mine"]
-    figure = compose_flow(FLOW, labels)
+    figure = plot_flow_errors(FLOW, labels)
     inside(figure)
     ade, fde = figure.axes
     colors = policy_colors(labels)
@@ -178,8 +169,8 @@ def test_pictures_replace_what_was_there(tmp_path: Path) -> None:
     paths[0].parent.mkdir()
     paths[0].write_text("old")
     draw_success([EASY, HARD], ["dp3", "fdp"], paths[0])
-    draw_curves(CURVES, ["dp3", "fdp"], paths[1])
-    draw_flow(FLOW, ["fdp", "mine"], paths[2])
+    draw_learning_curves(CURVES, ["dp3", "fdp"], paths[1])
+    draw_flow_errors(FLOW, ["fdp", "mine"], paths[2])
     assert sorted(paths[0].parent.iterdir()) == sorted(paths)
     for path in paths:
         picture = imread(path)
