@@ -1,17 +1,32 @@
 """Settings: the base of every model of them, and what YAML files and ``--set`` have in common."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic._internal._model_construction import ModelMetaclass
 
 from flowlab.errors import UsageError, unknown_name
 
 
-class Settings(BaseModel):
+class SettingsError(UsageError, ValueError):
+    """Settings that were made with a wrong value."""
+
+
+class _OneSentence(ModelMetaclass):
+    """Has a wrong value in ``EncoderSettings(points=0)`` be one sentence; validation from within pydantic is its own."""
+
+    def __call__(cls, *args: Any, **values: Any) -> Any:
+        try:
+            return super().__call__(*args, **values)
+        except ValidationError as error:
+            raise SettingsError(f"{cls.__name__}: {explain(error, cls)}") from error  # type: ignore[arg-type]
+
+
+class Settings(BaseModel, metaclass=_OneSentence):
     """A frozen group of settings. An unknown key is an error, never ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -39,22 +54,38 @@ def _shipped() -> Any:
     return installed if installed.is_dir() else Path(__file__).parents[1] / "pipelines"
 
 
-def override(values: dict[str, Any], text: str, known: Iterable[str], example: str) -> None:
-    """Apply ``key.path=value`` to nested settings; the first part must be one of ``known``."""
+def override(values: dict[str, Any], text: str, known: Iterable[str], example: str, kind: str = "setting") -> None:
+    """Apply a change to nested settings, in place.
+
+    Args:
+        values: The settings, as YAML has them.
+        text: The change, ``key.path=value``; the value is YAML.
+        known: What the first key must be one of.
+        example: Such a change, for people who wrote another thing.
+        kind: What ``known`` are, in the words of an error.
+
+    Raises:
+        UsageError: The change is none, or does not fit the settings.
+    """
     key, equals, _ = text.partition("=")
     path = key.split(".")
     if not equals or not all(path):
         raise UsageError(f"--set {text}: must look like {example}")
     if path[0] not in known:
-        raise unknown_name("setting", path[0], known)
+        raise unknown_name(kind, path[0], known)
     set_value(values, path, text)
 
 
 def set_value(values: dict[str, Any], path: Sequence[str], text: str) -> None:
-    """Put the YAML value behind the ``=`` of an override at a path of keys."""
+    """Put the YAML value behind the ``=`` of a change at a path of keys.
+
+    A group of settings that is switched off, or on with its defaults, is on with this value then.
+    """
     target, value = values, text.partition("=")[2]
     for part in path[:-1]:
-        target = target.setdefault(part, {})
+        if target.get(part) is None or isinstance(target[part], bool):
+            target[part] = {}
+        target = target[part]
         if not isinstance(target, dict):
             raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
     try:
@@ -70,7 +101,19 @@ def explain(error: ValidationError, model: type[Settings]) -> str:
     if first["type"] == "extra_forbidden":
         known = _fields_at(model, first["loc"][:-1])
         return f"{where}: {unknown_name('setting', str(first['loc'][-1]), known)}"
-    return f"{where}: {first['msg']} (found {first['input']!r})"
+    message = first["msg"].removeprefix("Value error, ")
+    if isinstance(first["input"], Mapping | BaseModel):  # to show a whole group would hide what is wrong in it
+        return f"{where}: {message}" if where else message
+    return f"{where}: {message} (found {first['input']!r})"
+
+
+def merge(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings with others put over them: groups are joined, anything else is replaced."""
+    merged = dict(values)
+    for key, value in changes.items():
+        old = merged.get(key)
+        merged[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return merged
 
 
 def _fields_at(model: type[Settings], path: tuple[int | str, ...]) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 from synthetic import assert_same, make_episode, with_quality
 from synthetic_clip import BOARD_M, CAMERA, WALL_M, film, record, truth
 
-from flowlab.engines.local import UnitResult
+from flowlab.engines.base import UnitResult
 from flowlab.errors import DataError, UsageError
 from flowlab.pipeline.labeling import estimate_cost, find_jobs, inspect_recording, label_recordings
 from flowlab.pipeline.recipe import Recipe, load_recipe
@@ -138,7 +138,7 @@ def test_a_dataset_of_recordings_is_sound(dataset: Dataset) -> None:
     assert [(r.task, r.name, r.seed) for r in dataset.manifest.recordings] == [
         ("slide", "take 1", 0), ("slide", "take 2", 1), ("slide", "take 10", 2),
     ]  # fmt: skip
-    assert dataset.manifest.camera == {}
+    assert dataset.manifest.provenance.camera == {}
     assert 0 < dataset.stats["quality"]["visible_sigma_m"]["p50"] < 0.05
     assert "by the tracker `lucas-kanade`" in (dataset.path / "README.md").read_text()
 
