@@ -9,15 +9,17 @@ if TYPE_CHECKING:
     from flowlab import data
     from flowlab.deployment.policy import Policy
     from flowlab.evaluation.evaluate import evaluate
+    from flowlab.grading.run import grade
     from flowlab.training.train import TrainedRun, train
 
-__all__ = ["Policy", "TrainedRun", "__version__", "data", "evaluate", "train"]
+__all__ = ["Policy", "TrainedRun", "__version__", "data", "evaluate", "grade", "train"]
 
 _LAZY = {
     "Policy": "flowlab.deployment.policy",
     "TrainedRun": "flowlab.training.train",
     "data": "flowlab",
     "evaluate": "flowlab.evaluation.evaluate",
+    "grade": "flowlab.grading.run",
     "train": "flowlab.training.train",
 }
 """Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""
