@@ -7,11 +7,97 @@ from flowlab.version import __version__
 
 if TYPE_CHECKING:
     from flowlab.deployment.policy import Policy
+    from flowlab.errors import (
+        DataError,
+        FlowlabError,
+        MissingFileError,
+        MissingLibraryError,
+        RecordError,
+        UnfinishedError,
+        UsageError,
+    )
+    from flowlab.geometry.camera import Camera
+    from flowlab.pipeline.extraction import extract
+    from flowlab.pipeline.labeling import label
+    from flowlab.pipeline.stage import Rejected, Stage
+    from flowlab.provenance import Channels, Provenance
+    from flowlab.records import (
+        Clip,
+        Cloud,
+        Demonstration,
+        Entity,
+        Episode,
+        FlowPrediction,
+        Frame,
+        Observation,
+        PositionSource,
+        Quality,
+        Queries,
+        Role,
+        Tracks2D,
+        Tracks3D,
+    )
+    from flowlab.storage.dataset import Dataset, open_dataset
 
-__all__ = ["Policy", "__version__"]
-
-_LAZY = {"Policy": "flowlab.deployment.policy"}
+_LAZY = {
+    **dict.fromkeys(("Dataset", "open_dataset"), "flowlab.storage.dataset"),
+    "extract": "flowlab.pipeline.extraction",
+    "label": "flowlab.pipeline.labeling",
+    "Policy": "flowlab.deployment.policy",
+    "Camera": "flowlab.geometry.camera",
+    **dict.fromkeys(
+        (
+            "Clip", "Cloud", "Demonstration", "Entity", "Episode", "FlowPrediction", "Frame", "Observation",
+            "PositionSource", "Quality", "Queries", "Role", "Tracks2D", "Tracks3D",
+        ),
+        "flowlab.records",
+    ),
+    **dict.fromkeys(("Channels", "Provenance"), "flowlab.provenance"),
+    **dict.fromkeys(("Rejected", "Stage"), "flowlab.pipeline.stage"),
+    **dict.fromkeys(
+        (
+            "DataError", "FlowlabError", "MissingFileError", "MissingLibraryError", "RecordError", "UnfinishedError",
+            "UsageError",
+        ),
+        "flowlab.errors",
+    ),
+}  # fmt: skip
 """Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""
+
+__all__ = [
+    "Camera",
+    "Channels",
+    "Clip",
+    "Cloud",
+    "DataError",
+    "Dataset",
+    "Demonstration",
+    "Entity",
+    "Episode",
+    "FlowPrediction",
+    "FlowlabError",
+    "Frame",
+    "MissingFileError",
+    "MissingLibraryError",
+    "Observation",
+    "Policy",
+    "PositionSource",
+    "Provenance",
+    "Quality",
+    "Queries",
+    "RecordError",
+    "Rejected",
+    "Role",
+    "Stage",
+    "Tracks2D",
+    "Tracks3D",
+    "UnfinishedError",
+    "UsageError",
+    "__version__",
+    "extract",
+    "label",
+    "open_dataset",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -19,3 +105,8 @@ def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'flowlab' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """Public names, those too that nobody has asked for yet."""
+    return sorted({*globals(), *_LAZY})

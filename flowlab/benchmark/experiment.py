@@ -13,12 +13,12 @@ from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
 from flowlab.benchmark.collect import describe_training
 from flowlab.benchmark.results import UNITS, PolicyResult, read_result, write_result
 from flowlab.config import Settings, explain, read_named
-from flowlab.engines.local import LocalEngine, StartEngine
+from flowlab.engines.base import StartEngine
+from flowlab.engines.local import LocalEngine
 from flowlab.errors import DataError, UnfinishedError, UsageError, unknown_name
 from flowlab.evaluation.evaluate import CheckpointRef, find_checkpoints, run_missing
 from flowlab.evaluation.trials import Trial, trials
 from flowlab.pipeline.extraction import extract
-from flowlab.pipeline.recipe import load_recipe
 from flowlab.policies.checkpoint import RUN, newest_checkpoint, read_run_config, read_trained, step_of
 from flowlab.policies.settings import POLICIES, TrainSettings, load_settings
 from flowlab.sim.tasks import GROUPS, select_tasks
@@ -203,7 +203,6 @@ def _finished(folder: Path) -> bool:
 
 def _extract(recipe: ExperimentRecipe, todo: Sequence[ExperimentUnit], out: Path, workers: int) -> None:
     """Make the datasets that units need: a moment's work beside training."""
-    engine = partial(LocalEngine, workers=workers)
     for folder, unit in {u.dataset: u for u in todo}.items():
         sampling = unit.settings.motion.sampling
         changes = [
@@ -211,7 +210,7 @@ def _extract(recipe: ExperimentRecipe, todo: Sequence[ExperimentUnit], out: Path
             f"queries.points={recipe.query_points}",
             f"queries.sampling={sampling}",
         ]
-        extract(load_recipe(recipe.recipe, changes), (unit.task,), out / folder, start_engine=engine)
+        extract([unit.task], out / folder, recipe=recipe.recipe, settings=changes, workers=workers)
 
 
 def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVariant | None = None) -> ExperimentUnit:

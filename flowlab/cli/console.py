@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import click
 from rich.console import Console
@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from flowlab.pipeline.scheduling import ExtractionProgress
     from flowlab.training.trainer import TrainingProgress
 
 console = Console(stderr=True)
@@ -55,7 +56,7 @@ class ProgressBar:
         self._start = self._last_line = time.monotonic()
         self._done_at_start: int | None = None
 
-    def __enter__(self) -> "ProgressBar":
+    def __enter__(self) -> Self:
         self._bar.start()
         return self
 
@@ -74,6 +75,20 @@ class ProgressBar:
             left = f", {(now - self._start) / fresh * (total - done):.0f} s left" if fresh else ""
             console.print(f"{note}: {done} of {total} episodes, {now - self._start:.0f} s{left}", highlight=False)
             self._last_line = now
+
+
+class ExtractionBar(ProgressBar):
+    """How far a dataset is. ``count_rejects`` says that what was rejected is done, too, as recordings are."""
+
+    def __init__(self, doing: str, quiet: bool, count_rejects: bool = False) -> None:
+        super().__init__(quiet)
+        self._doing, self._count_rejects = doing, count_rejects
+
+    def show(self, progress: "ExtractionProgress") -> None:
+        """Show how far the run is."""
+        note = f"{self._doing} ({progress.rejected} rejected)" if progress.rejected else self._doing
+        done = progress.accepted + (progress.rejected if self._count_rejects else 0)
+        self.update(done, progress.wanted, note)
 
 
 class TrainingBar:

@@ -10,7 +10,8 @@ import click
 
 if TYPE_CHECKING:
     from flowlab.records import Episode, FlowPrediction
-    from flowlab.storage.dataset import Dataset, EpisodeRef, RejectRef
+    from flowlab.storage.dataset import Dataset, RejectRef
+    from flowlab.storage.episodes import EpisodeRef
 
 
 @click.command()

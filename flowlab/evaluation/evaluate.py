@@ -9,7 +9,8 @@ import torch
 
 from flowlab.benchmark.results import Evaluation
 from flowlab.config import Settings
-from flowlab.engines.local import LocalEngine, StartEngine
+from flowlab.engines.base import StartEngine
+from flowlab.engines.local import LocalEngine
 from flowlab.errors import DataError, UnfinishedError, UsageError, unknown_name
 from flowlab.evaluation import trials as log
 from flowlab.evaluation.rollout import BATCH_SLOTS, SimulatorPool, roll_out
