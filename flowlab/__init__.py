@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from flowlab.version import __version__
 
 if TYPE_CHECKING:
+    from flowlab import data
     from flowlab.deployment.policy import Policy
     from flowlab.errors import (
         DataError,
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
         UnfinishedError,
         UsageError,
     )
+    from flowlab.evaluation.evaluate import evaluate
     from flowlab.geometry.camera import Camera
     from flowlab.pipeline.extraction import extract
     from flowlab.pipeline.labeling import label
@@ -38,11 +40,14 @@ if TYPE_CHECKING:
         Tracks3D,
     )
     from flowlab.storage.dataset import Dataset, open_dataset
+    from flowlab.training.train import TrainedRun, train
 
 _LAZY = {
     **dict.fromkeys(("Dataset", "open_dataset"), "flowlab.storage.dataset"),
     "extract": "flowlab.pipeline.extraction",
     "label": "flowlab.pipeline.labeling",
+    **dict.fromkeys(("TrainedRun", "train"), "flowlab.training.train"),
+    "evaluate": "flowlab.evaluation.evaluate",
     "Policy": "flowlab.deployment.policy",
     "Camera": "flowlab.geometry.camera",
     **dict.fromkeys(
@@ -91,17 +96,23 @@ __all__ = [
     "Stage",
     "Tracks2D",
     "Tracks3D",
+    "TrainedRun",
     "UnfinishedError",
     "UsageError",
     "__version__",
+    "data",
+    "evaluate",
     "extract",
     "label",
     "open_dataset",
+    "train",
 ]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for."""
+    if name == "data":
+        return import_module("flowlab.data")
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'flowlab' has no attribute '{name}'")
@@ -109,4 +120,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """Public names, those too that nobody has asked for yet."""
-    return sorted({*globals(), *_LAZY})
+    return sorted({*globals(), *__all__})

@@ -16,10 +16,9 @@ OLD = Path(__file__).parent / "fixtures" / "old"
 
 
 def test_every_public_name_is_there() -> None:
-    assert set(flowlab.__all__) == {*flowlab._LAZY, "__version__"}
+    assert set(flowlab.__all__) == {*flowlab._LAZY, "__version__", "data"}
     for name in flowlab.__all__:
-        if name != "Policy":  # which needs torch
-            assert getattr(flowlab, name) is not None
+        assert getattr(flowlab, name) is not None
     assert set(flowlab.__all__) <= set(dir(flowlab))
     with pytest.raises(AttributeError, match="has no attribute 'Episod'"):
         flowlab.Episod  # noqa: B018

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from flowlab.cli.console import ExtractionBar, print_json
+from flowlab.cli.console import ProgressBar, print_json, show_extraction
 
 
 @click.command("extract-sim")
@@ -59,10 +59,10 @@ def extract_sim(
         _dry_run(chosen, out, as_json, episodes=episodes, recipe=recipe, settings=changes, workers=workers)
         return
     start = time.monotonic()
-    with ExtractionBar("extracting", quiet=as_json) as bar:
+    with ProgressBar(quiet=as_json) as bar:
         dataset = extract(
             chosen, out, episodes=episodes, recipe=recipe, settings=changes, engine=engine, workers=workers,
-            shard=share, on_progress=bar.show,
+            shard=share, on_progress=lambda progress: show_extraction(bar, progress, "extracting"),
         )  # fmt: skip
     from flowlab.cli.reports import finish_extraction
 

@@ -1,5 +1,6 @@
 """``flowlab track-real``."""
 
+import json
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import click
 
-from flowlab.cli.console import ExtractionBar, print_json
+from flowlab.cli.console import ProgressBar, print_json, show_extraction
 from flowlab.errors import DataError, UsageError
 
 
@@ -19,6 +20,7 @@ from flowlab.errors import DataError, UsageError
 @click.option("--chunk", type=click.IntRange(min=1), help="Frames to a chunk [the recipe's: 33].")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next [the recipe's: 8].")
 @click.option("--weights", type=click.Path(path_type=Path), help="File with a learned tracker's weights.")
+@click.option("--reader", help="Short for --set recording.reader=NAME [the one that recognizes the recording].")
 @click.option("--calibration", type=click.Path(path_type=Path), help="YAML file with calibration for all of them.")
 @click.option("--recipe", default="real", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
@@ -35,6 +37,7 @@ def track_real(
     chunk: int | None,
     stride: int | None,
     weights: Path | None,
+    reader: str | None,
     calibration: Path | None,
     recipe: str,
     overrides: tuple[str, ...],
@@ -55,8 +58,8 @@ def track_real(
     """
     from flowlab.pipeline.units import JobShard
 
-    lengths = {"track.chunks.length": chunk, "track.chunks.stride": stride}
-    changes = [*overrides, *(f"{key}={value}" for key, value in lengths.items() if value is not None)]
+    short = {"track.chunks.length": chunk, "track.chunks.stride": stride, "recording.reader": reader}
+    changes = [*overrides, *(f"{key}={json.dumps(value)}" for key, value in short.items() if value is not None)]
     share = JobShard.parse(shard)
     if out is None and not dry_run:
         raise UsageError("name the folder of the dataset, as in --out data/pour; or look first with --dry-run")
@@ -68,10 +71,11 @@ def track_real(
     from flowlab.pipeline.labeling import label
 
     start = time.monotonic()
-    with ExtractionBar("labeling", quiet=as_json, count_rejects=True) as bar:
+    with ProgressBar(quiet=as_json) as bar:
         dataset = label(
             paths, out, task=task, tracker=tracker, calibration=calibration, weights=weights, recipe=recipe,
-            settings=changes, engine=engine, workers=workers, shard=share, on_progress=bar.show,
+            settings=changes, engine=engine, workers=workers, shard=share,
+            on_progress=lambda progress: show_extraction(bar, progress, "labeling", count_rejects=True),
         )  # fmt: skip
     finish_extraction(dataset, time.monotonic() - start, share, as_json)
 

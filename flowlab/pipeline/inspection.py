@@ -13,7 +13,7 @@ from flowlab.pipeline.labeling import recording_stage
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.stages.recording import QualityStage, TrackStage
-from flowlab.recordings.recording import Description, Recording, describe
+from flowlab.recordings.recording import Recording, RecordingDescription, describe
 from flowlab.storage.recorded import Recorded
 from flowlab.tracking.base import make_tracker
 
@@ -26,7 +26,7 @@ class InspectedRecording:
     """A recording, and what is recognized of it."""
 
     recorded: Recorded
-    description: Description | None
+    description: RecordingDescription | None
     """None where nothing could be recognized."""
     problem: str | None
     """Why it cannot be labeled as it is; None where it can."""

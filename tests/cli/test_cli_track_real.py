@@ -240,8 +240,12 @@ def test_short_options_are_settings(recordings: Path, tmp_path: Path, capsys: py
 MISTAKES = {
     "no path": ("--out x", 2, "PATH"),
     "no out": ("rec", 2, "--out data/pour; or look first with --dry-run"),
-    "unknown tracker": ("rec --out x --tracker bodie", 2, "no tracker is called 'bodie'; did you mean bodies"),
-    "unknown tracker, dry": ("rec --dry-run --tracker bodie", 2, "no tracker is called 'bodie'"),
+    "unknown tracker": (
+        "rec --out x --tracker rigid-bodie",
+        2,
+        "no tracker is called 'rigid-bodie'; did you mean rigid-bodies",
+    ),
+    "unknown tracker, dry": ("rec --dry-run --tracker rigid-bodie", 2, "no tracker is called 'rigid-bodie'"),
     "unknown option": (
         "rec --out x --tracker lucas-kanade --set track.options.windw=3",
         2,
@@ -283,8 +287,8 @@ def test_a_mistake_gives_one_sentence_and_its_exit_code(
 
 def test_simulation_refuses_the_recipe_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, errors = call_cli(capsys, "extract-sim", "hammer", "--out", tmp_path / "x", "--recipe", "real")
-    assert code == 1
-    assert "needs an 'expert' stage" in errors
+    assert code == 2
+    assert "needs a stage that simulates" in errors
     assert list(tmp_path.iterdir()) == []
 
 

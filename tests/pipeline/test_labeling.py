@@ -13,7 +13,7 @@ from synthetic_clip import BOARD_M, CAMERA, WALL_M, film, record, truth
 
 from flowlab.engines.base import UnitResult
 from flowlab.errors import DataError, UsageError
-from flowlab.pipeline.inspection import estimate_cost
+from flowlab.pipeline.inspection import estimate_cost, inspect_recordings
 from flowlab.pipeline.labeling import find_jobs, label_recordings
 from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
