@@ -60,12 +60,11 @@ def run_experiment(
     report = on_progress or (lambda fresh, done, of: None)
     known = {u.name: result for u in units if (result := _known_result(out, u, recipe)) is not None}
     todo = [u for u in units if u.name not in known]
+    engine_class: Any = ENGINES.load(engine)
+    start_engine = partial(engine_class, workers=workers or len(os.sched_getaffinity(0)))
+    _extract(recipe, todo, out, start_engine)
     report(list(known.values()) if todo else [], len(known), len(units))
     if todo:
-        workers = workers or len(os.sched_getaffinity(0))
-        engine_class: Any = ENGINES.load(engine)
-        start_engine = partial(engine_class, workers=workers)
-        _extract(recipe, todo, out, start_engine)
         _run_units(recipe, todo, out, start_engine, known, lambda r: report([r], len(known), len(units)))
     return [known[u.name] for u in units]
 

@@ -25,8 +25,8 @@ from flowlab.sim.simulation import CameraSettings, SceneSettings
 
 Capture = pytest.CaptureFixture[str]
 TASK = "drawer-open"
-SHORT = options(
-    *NETWORK, "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=0", "diffusion.inference_steps=2"
+SHORT = "--profile", str(NETWORK), *options(
+    "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=0", "diffusion.inference_steps=2"
 )  # fmt: skip
 PLACE = "evaluation/step-00000002-execute-8/episodes.jsonl"
 SIX = ("--task", TASK, "--seeds", 0, "--episodes", 6)
