@@ -6,17 +6,29 @@ from typing import TYPE_CHECKING, Any
 from flowlab.version import __version__
 
 if TYPE_CHECKING:
+    from flowlab import data
     from flowlab.deployment.policy import Policy
     from flowlab.evaluation.evaluate import evaluate
+    from flowlab.evaluation.results import PolicyResult
+    from flowlab.training.train import TrainedRun, train
 
-__all__ = ["Policy", "__version__", "evaluate"]
+__all__ = ["Policy", "PolicyResult", "TrainedRun", "__version__", "data", "evaluate", "train"]
 
-_LAZY = {"Policy": "flowlab.deployment.policy", "evaluate": "flowlab.evaluation.evaluate"}
+_LAZY = {
+    "Policy": "flowlab.deployment.policy",
+    "PolicyResult": "flowlab.evaluation.results",
+    "TrainedRun": "flowlab.training.train",
+    "data": "flowlab",
+    "evaluate": "flowlab.evaluation.evaluate",
+    "train": "flowlab.training.train",
+}
 """Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for."""
     if name in _LAZY:
+        if _LAZY[name] == "flowlab":
+            return import_module(f"flowlab.{name}")
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'flowlab' has no attribute '{name}'")

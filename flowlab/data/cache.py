@@ -21,9 +21,7 @@ ArraysOf = Callable[[Episode], tuple[Mapping[str, np.ndarray], Mapping[str, np.n
 """Takes out of an episode what is cached: arrays with a row per frame, and arrays of the whole episode."""
 
 
-def cached_arrays(
-    source: TrainingSource, fallback: Path, part: str, arrays_of: ArraysOf
-) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+def cached_part(source: TrainingSource, fallback: Path, part: str, arrays_of: ArraysOf) -> Path:
     """A part of a dataset, decoded into ``cache`` below it, or into that of ``fallback`` where it cannot be written.
 
     Args:
@@ -33,19 +31,11 @@ def cached_arrays(
         arrays_of: What the part is of an episode.
 
     Returns:
-        The episodes in order of task and seed, as ``task``, ``seed``, ``start`` and ``stop``; and the arrays by name,
-        mapped into memory: a row per frame, the episodes one behind the other as they are stored, or a row per
-        episode, in their order.
+        The folder of the part, for :func:`open_part`.
 
     Raises:
         DataError: Neither folder can be written, or the episodes are of different widths.
     """
-    folder = _find_or_decode(source, fallback, part, arrays_of)
-    index = read_json(folder / INDEX)
-    return index["episodes"], {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in index["arrays"]}
-
-
-def _find_or_decode(source: TrainingSource, fallback: Path, part: str, arrays_of: ArraysOf) -> Path:
     content = f"{source.fingerprint}-{_FORMAT}"
     candidates = [parent / "cache" / f"{content}-{part}" for parent in (source.path, fallback)]
     for folder in candidates:
@@ -53,7 +43,7 @@ def _find_or_decode(source: TrainingSource, fallback: Path, part: str, arrays_of
             return folder
     writable = next((c for c in candidates if _is_writable(c.parent)), None)
     if writable is None:
-        raise DataError(f"{fallback}: cannot be written; choose another folder with --out")
+        raise DataError(f"{fallback}: cannot be written; choose another --out, or in Python another cache")
     with locked(writable.parent):
         if not (writable / INDEX).exists():
             remove_leftovers(writable.parent)
@@ -69,6 +59,17 @@ def _find_or_decode(source: TrainingSource, fallback: Path, part: str, arrays_of
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
     return writable
+
+
+def open_part(folder: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+    """A part of a dataset, mapped into memory.
+
+    Returns:
+        The episodes in order of task and seed, as ``task``, ``seed``, ``start`` and ``stop``; and the arrays by name: a
+        row per frame, the episodes one behind the other as they are stored, or a row per episode, in their order.
+    """
+    index = read_json(folder / INDEX)
+    return index["episodes"], {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in index["arrays"]}
 
 
 def _is_writable(folder: Path) -> bool:

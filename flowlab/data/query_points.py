@@ -27,6 +27,8 @@ def choose_queries(buffer: ReplayBuffer, needs: FlowNeeds) -> Int[np.ndarray, "E
         raise DataError(
             f"motion.points is {needs.points}, and the dataset has {found} query points; add --set motion.points="
             f"{found}, or make the dataset with --set queries.points={needs.points}"
+            if found
+            else "the dataset has no query points, and the policy learns from how they move; train --policy dp3"
         )
     return np.stack([_choose(buffer, k, needs) for k in range(len(buffer.episodes))])
 

@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from flowlab.data.cache import cached_arrays
+from flowlab.data.cache import cached_part, open_part
 from flowlab.data.source import TrainingSource
 from flowlab.records import Episode
+
+ARRAYS = "arrays"
+"""Name of the cached part of a dataset that holds everything but pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +85,7 @@ def load_buffer(source: TrainingSource, fallback: Path, pictures: Sequence[str] 
     Raises:
         DataError: Neither folder can be written, or the episodes are of different widths.
     """
-    episodes, arrays = cached_arrays(source, fallback, "arrays", arrays_of)
+    episodes, arrays = open_part(cached_part(source, fallback, ARRAYS, arrays_of))
     slices = tuple(EpisodeSlice(**e) for e in episodes)
     known = {name: array for name, array in arrays.items() if name in ReplayBuffer.__dataclass_fields__}
     return ReplayBuffer(slices, **known, **load_pictures(source, fallback, pictures))
@@ -92,7 +95,7 @@ def load_pictures(source: TrainingSource, fallback: Path, names: Sequence[str]) 
     """Those of the pictures (F, H, W, ...) that the dataset has; each kind has a cache of its own."""
     found: dict[str, np.ndarray] = {}
     for name in names:
-        found |= cached_arrays(source, fallback, name, partial(pictures_of, name=name))[1]
+        found |= open_part(cached_part(source, fallback, name, partial(pictures_of, name=name)))[1]
     return found
 
 
