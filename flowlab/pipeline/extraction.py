@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.engines.base import Engine, StartEngine, UnitResult
-from flowlab.errors import FlowlabError, UnfinishedError
+from flowlab.errors import FlowlabError, MissingFileError, UnfinishedError
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, SeedScheduler, UnitScheduler
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
@@ -79,6 +79,8 @@ def fill(
     try:
         manifest = begin(folder, manifest)
         log.unlink(missing_ok=True)
+    except MissingFileError:
+        raise
     except OSError as error:
         raise _storage_error(folder, error) from error
     work = partial(run_unit, recipe.model_dump_json(), recipe.folder, manifest.settings_digest, folder)
@@ -86,6 +88,8 @@ def fill(
         with start_engine(work) as engine:
             failures = run_all(engine, plan_for(manifest), folder, share, report)
         dataset = summarize(folder)
+    except MissingFileError:
+        raise
     except OSError as error:
         raise _storage_error(folder, error) from error
     except BaseException:

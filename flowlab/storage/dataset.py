@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, MissingFileError
 from flowlab.files import locked, remove_leftovers, write_atomically, write_json
 from flowlab.records import Episode
 from flowlab.storage import stats
@@ -54,7 +54,7 @@ class Dataset:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         if not self.path.exists():
-            raise DataError(f"{self.path}: there is no such folder")
+            raise MissingFileError(f"{self.path}: there is no such folder")
         self.manifest = Manifest.read(self.path)
         self.receipts = read_receipts(self.path)
 

@@ -109,7 +109,8 @@ def test_predicted_flow_is_off_by_what_one_works_out_by_hand(tmp_path: Path, own
     """Of a recording, the camera is its own. The first is planned in two portions, of 64 windows at most."""
     cameras = [NEAR if own_camera else CAMERA, CAMERA]
     demos = [gliding(k, steps, camera) for k, (steps, camera) in enumerate(zip((80, 14), cameras, strict=True))]
-    make_dataset(tmp_path / "d", [[d] for d in demos], **({"provenance": make_provenance(camera={})} if own_camera else {}))
+    changes = {"provenance": make_provenance(camera={})} if own_camera else {}
+    make_dataset(tmp_path / "d", [[d] for d in demos], **changes)
     settings = tiny_settings("fdp", "encoder.points=24")
     report = evaluate_offline(untrained(tmp_path, Drawer, settings), tmp_path / "d")
     wanted = [by_hand(d) for d in demos]
