@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32
 
 from flowlab.evaluation.results import RolloutFlowError
 from flowlab.geometry.camera import Camera
-from flowlab.grading.metrics import tapvid
+from flowlab.grading.tapvid import tapvid
 from flowlab.records import Queries
 from flowlab.sim.recorder import Rollout
 from flowlab.sim.tracks import RigidFlowSettings, rigid_tracks

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from flowlab.config import Settings
 from flowlab.geometry.camera import Camera
-from flowlab.grading.metrics import tapvid
+from flowlab.grading.tapvid import tapvid
 
 
 class FlowError(Settings):

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from flowlab.grading.metrics import CURVE_MM, Calibration, TrackMetrics
+from flowlab.grading.calibration import Calibration
+from flowlab.grading.metrics import CURVE_MM, TrackMetrics
 from flowlab.viz.plot_style import INK, QUIET, SERIES, new_figure, save_png, set_title, style_axes
 
 GROUPS = {

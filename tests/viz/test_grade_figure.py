@@ -9,7 +9,7 @@ from matplotlib.image import imread
 
 from flowlab.geometry.camera import Camera
 from flowlab.grading.ground_truth import GroundTruth
-from flowlab.grading.metrics import CURVE_MM, Estimate, TrackMetrics, measure
+from flowlab.grading.metrics import CURVE_MM, EstimatedTracks, TrackMetrics, measure
 from flowlab.viz.grade_figure import GROUPS, RELIABILITY_POINTS, draw_grades, plot_grades
 
 CAMERA = Camera(320, 240, np.diag([250.0, 250.0, 1.0]), np.eye(4))
@@ -24,7 +24,9 @@ def make_metrics(error_m: float, *, roles: bool = True, sigma: bool = True) -> T
     truth = GroundTruth(np.zeros((30, 2), np.float32), tracks, visible, np.full(30, 2, np.int8) if roles else None)
     error = rng.uniform(0, 2 * error_m, (20, 30))
     stated = (error * 1.1).astype(np.float32) if sigma else None
-    return measure(Estimate((tracks + error[..., None] * [0, 0, 1]).astype(np.float32), visible, stated), truth, CAMERA)
+    return measure(
+        EstimatedTracks((tracks + error[..., None] * [0, 0, 1]).astype(np.float32), visible, stated), truth, CAMERA
+    )
 
 
 def test_a_panel_for_each_group_and_a_line_for_each_tracker() -> None:

@@ -12,11 +12,11 @@ from pydantic import Field
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader
-from flowlab.recordings.frame_check import Survey, side_by_side, survey
-from flowlab.recordings.imaging import Imaging, make_imaging
+from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
+from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
 from flowlab.recordings.sample_files import load_samples
-from flowlab.recordings.timing import nearest, previous
+from flowlab.recordings.sync import last_sample, nearest_sample
 
 
 class RecordingSettings(Settings):
@@ -45,14 +45,14 @@ class RecordingSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class AlignedSamples:
     """The numbers of every row."""
 
     clock_s: Float64[np.ndarray, "T"]
     """On the clock of the recording."""
     state: Float32[np.ndarray, "T S"]
     action: Float32[np.ndarray, "T A"]
-    action_is: str
+    action_source: str
     """How the action was found, in words."""
 
 
@@ -65,7 +65,7 @@ class ParsedRecording:
     streams: Streams
     metadata: Metadata
     origin: Mapping[str, str]
-    survey: Survey
+    frame_check: FrameCheck
 
     @property
     def write_to(self) -> str:
@@ -73,13 +73,13 @@ class ParsedRecording:
         file = self.path / FILE_NAME if self.path.is_dir() else self.path.with_suffix(".yaml")
         return f"{file} (or the calibration file)"
 
-    def imaging(self, settings: RecordingSettings) -> Imaging:
+    def frame_processor(self, settings: RecordingSettings) -> FrameProcessor:
         """What makes frames of it. Raises :class:`DataError` where calibration is missing or cannot be."""
-        seen = self.survey
+        seen = self.frame_check
         if not len(seen.color):
             first = f"; {seen.bad[0].name} {seen.bad[0].reason}" if seen.bad else ""
             raise DataError(f"{self.path}: none of {seen.looked_at} frames can be used{first}")
-        return make_imaging(
+        return make_frame_processor(
             self.path,
             self.metadata,
             seen.color_size,
@@ -92,7 +92,7 @@ class ParsedRecording:
 
     def check_bad_frames(self, settings: RecordingSettings) -> None:
         """Raise :class:`DataError` where there are more bad frames than the settings allow."""
-        seen = self.survey
+        seen = self.frame_check
         allowed = 0.0 if settings.bad_frames == "reject" else settings.max_bad_share
         if len(seen.bad) > allowed * seen.looked_at or len(seen.color) < 2:
             some = "; ".join(f"{b.name} {b.reason}" for b in seen.bad[:3]) or "there are no others"
@@ -101,20 +101,20 @@ class ParsedRecording:
                 f"and {'none' if not allowed else f'at most {allowed:.0%}'} may be; see max_bad_share and max_sync_s"
             )
 
-    def rows(self) -> Rows:
+    def rows(self) -> AlignedSamples:
         """What the robot was and did at every row."""
-        clock = self.streams.color.time_s[self.survey.color]
-        state = side_by_side(self.streams.state, clock, nearest)
+        clock = self.streams.color.time_s[self.frame_check.color]
+        state = align_samples(self.streams.state, clock, nearest_sample)
         if self.streams.action:
-            action, how = side_by_side(self.streams.action, clock, previous), "the last one recorded up to the row"
+            action, how = align_samples(self.streams.action, clock, last_sample), "the last one recorded up to the row"
         elif self.streams.state:
             action, how = np.concatenate([state[1:], state[-1:]]), "state of the next row"
         else:
             action, how = state, "none recorded"
-        return Rows(clock, state, action, how)
+        return AlignedSamples(clock, state, action, how)
 
 
-def recognize(path: Path, settings: RecordingSettings) -> ParsedRecording:
+def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     """Read the streams, find out what is known of them, and look at every picture."""
     reader = choose_reader(path, settings.reader)
     given = list(_given(path, settings))
@@ -124,7 +124,7 @@ def recognize(path: Path, settings: RecordingSettings) -> ParsedRecording:
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
     metadata, origin = combine([*given, *streams.known])
     streams = _with_files(path, streams, metadata)
-    seen = survey(
+    seen = check_frames(
         streams,
         every=settings.every,
         start_s=settings.start_s,
@@ -133,6 +133,15 @@ def recognize(path: Path, settings: RecordingSettings) -> ParsedRecording:
         max_state_s=settings.max_state_s,
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
+
+
+def known_beforehand(path: Path, settings: RecordingSettings) -> Metadata:
+    """What the user says of a recording, in the calibration file and in ``recording.yaml`` in or beside it.
+
+    Raises:
+        DataError: One of these files is not as it should be.
+    """
+    return combine(_given(path, settings))[0]
 
 
 def _given(path: Path, settings: RecordingSettings) -> Iterator[tuple[str, Metadata]]:

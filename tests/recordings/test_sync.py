@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowlab.recordings.timing import gaps, nearest, previous, rate
+from flowlab.recordings.sync import find_gaps, last_sample, nearest_sample, sampling_rate
 
 instants = st.lists(st.integers(0, 40).map(lambda k: k / 8), min_size=1, max_size=40)
 
@@ -13,7 +13,7 @@ instants = st.lists(st.integers(0, 40).map(lambda k: k / 8), min_size=1, max_siz
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(instants, instants.map(sorted))
 def test_nearest_is_what_a_search_of_all_finds(clock: list[float], time_s: list[float]) -> None:
-    found = nearest(np.array(clock), np.array(time_s))
+    found = nearest_sample(np.array(clock), np.array(time_s))
     distance = np.abs(np.array(time_s)[None] - np.array(clock)[:, None])
     np.testing.assert_array_equal(distance[np.arange(len(clock)), found], distance.min(1))
     ties = [min(np.array(time_s)[row == row.min()]) for row in distance]
@@ -23,7 +23,7 @@ def test_nearest_is_what_a_search_of_all_finds(clock: list[float], time_s: list[
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(instants, instants.map(sorted))
 def test_previous_is_the_last_that_is_not_later(clock: list[float], time_s: list[float]) -> None:
-    found = previous(np.array(clock), np.array(time_s))
+    found = last_sample(np.array(clock), np.array(time_s))
     for t, k in zip(clock, found, strict=True):
         before = [i for i, s in enumerate(time_s) if s <= t]
         assert k == (before[-1] if before else 0)
@@ -34,21 +34,21 @@ def test_previous_is_the_last_that_is_not_later(clock: list[float], time_s: list
 def test_missing_samples_are_gaps_and_nothing_else_is(count: int, step: float, data: st.DataObject) -> None:
     lost = data.draw(st.integers(1, count - 1))
     time_s = step * np.array([k for k in range(2 * count) if k != lost])
-    assert gaps(step * np.arange(count)) == ()
-    ((start, length),) = gaps(time_s)
+    assert find_gaps(step * np.arange(count)) == ()
+    ((start, length),) = find_gaps(time_s)
     assert (start, length) == pytest.approx((step * (lost - 1), 2 * step))
-    assert rate(time_s) == pytest.approx(1 / step)
+    assert sampling_rate(time_s) == pytest.approx(1 / step)
 
 
 def test_a_jittering_stream_has_no_gaps() -> None:
     rng = np.random.default_rng(0)
     time_s = np.arange(200) / 30 + rng.uniform(-0.005, 0.005, 200)
-    assert gaps(time_s) == ()
-    assert rate(time_s) == pytest.approx(30, rel=0.05)
+    assert find_gaps(time_s) == ()
+    assert sampling_rate(time_s) == pytest.approx(30, rel=0.05)
 
 
 def test_one_sample_is_near_to_all_and_has_no_rate() -> None:
-    np.testing.assert_array_equal(nearest(np.arange(3.0), np.array([9.0])), 0)
-    np.testing.assert_array_equal(previous(np.arange(3.0), np.array([9.0])), 0)
-    assert rate(np.array([1.0])) == 0
-    assert gaps(np.array([1.0, 2.0])) == ()
+    np.testing.assert_array_equal(nearest_sample(np.arange(3.0), np.array([9.0])), 0)
+    np.testing.assert_array_equal(last_sample(np.arange(3.0), np.array([9.0])), 0)
+    assert sampling_rate(np.array([1.0])) == 0
+    assert find_gaps(np.array([1.0, 2.0])) == ()

@@ -9,7 +9,7 @@ import numpy as np
 
 from flowlab.errors import DataError
 
-_HARMLESS = {
+_ALLOWED = {
     *((f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")),
     *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
     ("numpy", "ndarray"),
@@ -23,12 +23,12 @@ class _Unpickler(pickle.Unpickler):
     """Makes arrays, numbers, text and mappings of them; a pickle that asks for more is refused."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _HARMLESS:
+        if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}")
         return super().find_class(module, name)
 
 
-def load_object(path: Path) -> dict[str, Any]:
+def load_pickled_mapping(path: Path) -> dict[str, Any]:
     """The mapping that ``numpy.save`` stored as an object; empty where there is no such file."""
     try:
         content = io.BytesIO(path.read_bytes())

@@ -19,7 +19,7 @@ PLAUSIBLE_M = (0.02, 100.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Imaging:
+class FrameProcessor:
     """Makes the color and the depth of frames."""
 
     camera: Camera
@@ -62,7 +62,7 @@ def to_meters(counts: np.ndarray, unit_m: float) -> Float32[np.ndarray, "H W"]:
     return depth
 
 
-def make_imaging(
+def make_frame_processor(
     path: Path,
     metadata: Metadata,
     color: Size,
@@ -72,7 +72,7 @@ def make_imaging(
     max_width: int,
     write_to: str,
     median_counts: float,
-) -> Imaging:
+) -> FrameProcessor:
     """What turns pictures of these sizes into frames. Raises :class:`DataError` with the lines to write.
 
     ``median_counts`` is a typical reading, to tell a wrong depth unit by; ``write_to`` names the file that
@@ -89,7 +89,7 @@ def make_imaging(
     if intrinsics.is_distorted:
         maps = cv2.initUndistortRectifyMap(K, np.array(intrinsics.distortion), np.eye(3), K, color, cv2.CV_32FC1)
     shrunk = Camera(*size, shrink_intrinsics(K, factor), T_world_cam)
-    return Imaging(shrunk, unit, factor, maps, registration)
+    return FrameProcessor(shrunk, unit, factor, maps, registration)
 
 
 def shrink_intrinsics(K: np.ndarray, factor: int) -> np.ndarray:
