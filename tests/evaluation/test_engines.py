@@ -65,9 +65,8 @@ def test_the_function_is_what_the_command_calls(run: Path, tmp_path: Path, capsy
     """The same results, told how far it is; nothing is tried twice."""
     mine, theirs = (Path(shutil.copytree(run, tmp_path / name / "dp3")) for name in ("mine", "theirs"))
     told: list[tuple[int, int]] = []
-    (result,) = flowlab.evaluate(
-        mine, tasks=["drawer-open"], seeds=[0], episodes=2, workers=1, on_progress=lambda done, of: told.append((done, of))
-    )
+    asked: dict[str, Any] = {"tasks": ["drawer-open"], "seeds": [0], "episodes": 2}
+    (result,) = flowlab.evaluate(mine, **asked, workers=1, on_progress=lambda done, of: told.append((done, of)))
     assert isinstance(result, flowlab.PolicyResult)
     assert (told[0], told[-1]) == ((0, 2), (2, 2))
     assert result.success_rate == sum(o.success for o in result.final) / 2
@@ -77,7 +76,7 @@ def test_the_function_is_what_the_command_calls(run: Path, tmp_path: Path, capsy
     assert code == 0, err
     assert json.loads(said) == [result.model_dump(mode="json", exclude_defaults=True)]
     before = (mine / LINES).stat().st_mtime_ns
-    assert flowlab.evaluate([str(mine)], tasks=["drawer-open"], seeds=[0], episodes=2) == [result]
+    assert flowlab.evaluate([str(mine)], **asked) == [result]
     assert (mine / LINES).stat().st_mtime_ns == before
 
 

@@ -39,7 +39,7 @@ def _make(place: Path, name: str, expert: str) -> Path:
     (place / f"{name}.yaml").write_text(json.dumps(recipe))
     data = place / name / "data"
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        main("extract-sim", "drawer-open", "--recipe", str(place / f"{name}.yaml"), "--workers", "1", "--out", str(data))
+        main("extract-sim", "drawer-open", "--recipe", f"{place}/{name}.yaml", "--workers", "1", "--out", str(data))
     short = options("run.minutes=null", "run.steps=2", "run.checkpoints=1", "run.validations=0")
     command = (data, "--policy", "fdp", "--profile", NETWORK, *short, "--device", "cpu", "--out", place / name / "fdp")
     return make_run(*command)
