@@ -35,7 +35,6 @@ from extract import machine, print_rows
 
 from flowlab.data.batches import ObservationBatch
 from flowlab.deployment.runner import PolicyRunner
-from flowlab.engines.local import LocalEngine
 from flowlab.evaluation import rollout
 from flowlab.evaluation.rollout import MAX_STEPS, SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial, list_trials
@@ -268,7 +267,7 @@ def summary(found: dict[str, list[Tried]]) -> list[dict[str, Any]]:
 def untrained(folder: Path) -> LoadedPolicy:
     """A policy for push after a single step; after fifty, it would solve some scene_seeds."""
     recipe = load_recipe("metaworld", ["episodes=3"])
-    extract(recipe, ("push",), folder / "data", start_engine=partial(LocalEngine, workers=1))
+    extract(["push"], folder / "data", recipe=recipe, workers=1)
     settings = load_settings("fast", "fdp", ["run.minutes=null", "run.steps=1", "data.held_out=0"])
     run(prepare_run(folder / "data", folder / "run", settings, ComputeSettings(device="cpu")), lambda _: None)
     return load_policy(folder / "run")

@@ -13,7 +13,6 @@ import json
 import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ import torch
 from simple_dp3 import Ema, SimpleDP3, make_batch, make_optimizer
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.engines.local import LocalEngine
 from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import list_trials
 from flowlab.pipeline.extraction import extract
@@ -73,7 +71,7 @@ def make_data(task: str, folder: Path) -> Path:
     """Ten demonstrations of a task."""
     data = folder / task
     recipe = load_recipe("metaworld", ["episodes=10"])
-    extract(recipe, (task,), data, start_engine=partial(LocalEngine, workers=1))
+    extract([task], data, recipe=recipe, workers=1)
     return data
 
 

@@ -4,39 +4,34 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import pytest
 from synthetic import call_cli
 from trained_runs import NETWORK, make_run, options
 
 import flowlab
-from flowlab.engines.base import UnitResult
+from flowlab.engines.base import Engine, UnitResult
 
 Capture = pytest.CaptureFixture[str]
 LINES = "evaluation/step-00000002-execute-8/episodes.jsonl"
 STARTED: list[dict[str, Any]] = []
 
 
-class InThisProcess:
+class InThisProcess(Engine[Any, Any]):
     """An engine as somebody may write it: one unit after the other, here."""
 
-    def __init__(self, work: Callable[[Any], Any], workers: int, imports: Sequence[str] = ()) -> None:
+    def __init__(self, work: Callable[[Any], Any], *, workers: int, imports: Sequence[str] = ()) -> None:
+        super().__init__(work, workers=workers, imports=imports)
         STARTED.append({"workers": workers, "imports": list(imports)})
-        self._work, self._units = work, []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self._units.clear()
+        self._units: list[Any] = []
 
     def submit(self, unit: Any) -> None:
         self._units.append(unit)
 
     def next_result(self) -> UnitResult[Any, Any]:
         unit = self._units.pop(0)
-        return UnitResult(unit, self._work(unit))
+        return UnitResult(unit, self.work(unit))
 
 
 @pytest.fixture(scope="module")
