@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         UsageError,
     )
     from flowlab.evaluation.evaluate import evaluate
+    from flowlab.evaluation.results import PolicyResult
     from flowlab.geometry.camera import Camera
     from flowlab.grading.run import grade
     from flowlab.pipeline.extraction import extract
@@ -50,6 +51,7 @@ _LAZY = {
     **dict.fromkeys(("TrainedRun", "train"), "flowlab.training.train"),
     "evaluate": "flowlab.evaluation.evaluate",
     "grade": "flowlab.grading.run",
+    "PolicyResult": "flowlab.evaluation.results",
     "Policy": "flowlab.deployment.policy",
     "Camera": "flowlab.geometry.camera",
     **dict.fromkeys(
@@ -88,6 +90,7 @@ __all__ = [
     "MissingLibraryError",
     "Observation",
     "Policy",
+    "PolicyResult",
     "PositionSource",
     "Provenance",
     "Quality",
