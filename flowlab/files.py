@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, MissingFileError
 
 
 def temporary_path(path: Path) -> Path:
@@ -76,6 +76,6 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text())
     except FileNotFoundError as error:
-        raise DataError(f"{path}: there is no such file") from error
+        raise MissingFileError(f"{path}: there is no such file") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not valid JSON ({error}); restore it or extract again into a new folder") from error

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from flowlab.errors import UsageError, first_line, unknown_name
@@ -84,9 +85,13 @@ class Registry(Generic[T]):
 
     def _from_path(self, place: str, folder: Path | None) -> Any:
         module, _, attribute = place.partition(":")
+        package = module.partition(".")[0]
+        _forget_others(package, folder)
         with _looked_at_last(folder):
             try:
-                return getattr(importlib.import_module(module), attribute)
+                imported = importlib.import_module(module)
+                _remember(package, imported, folder)
+                return getattr(imported, attribute)
             except Exception as error:  # whatever somebody's module does
                 raise UsageError(f"{self.kind} '{place}': cannot be imported ({first_line(error)})") from error
 
@@ -115,6 +120,24 @@ def _members(protocol: type) -> list[str]:
 
 def _package(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"
+
+
+_lent: dict[str, Path] = {}
+"""Folder that a module or package was imported from because it was lent for that, by its name."""
+
+
+def _forget_others(name: str, folder: Path | None) -> None:
+    """Forget a package's modules that another folder lent: nobody may get those of somebody else."""
+    if folder is not None and _lent.get(name, folder.resolve()) != folder.resolve():
+        del _lent[name]
+        for module in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+            del sys.modules[module]
+
+
+def _remember(name: str, module: ModuleType, folder: Path | None) -> None:
+    """Remember that a package's module is from a folder, where it is."""
+    if folder is not None and Path(module.__file__ or "").resolve().is_relative_to(folder.resolve()):
+        _lent[name] = folder.resolve()
 
 
 @contextmanager

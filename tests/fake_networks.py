@@ -218,7 +218,7 @@ def write_cotracker(folder: Path) -> Path:
     (folder / "cotracker" / "__init__.py").touch()
     names = "CoTrackerOnlinePredictor, CoTrackerPredictor"
     seeding = "import torch\n\ntorch.manual_seed(0)\n"  # as several of the real modules do
-    (folder / "cotracker" / "predictor.py").write_text(f"from stand_ins import {names}\n{seeding}")
+    (folder / "cotracker" / "predictor.py").write_text(f"from fake_networks import {names}\n{seeding}")
     (folder / "hubconf.py").write_text(_HUBCONF)
     return folder
 
@@ -380,6 +380,6 @@ def write_tapnet(folder: Path) -> Path:
         module = folder / "tapnet" / name
         module.parent.mkdir(parents=True, exist_ok=True)
         (module.parent / "__init__.py").touch()
-        module.write_text(f"from stand_ins import {content}\n")
+        module.write_text(f"from fake_networks import {content}\n")
     (folder / "tapnet" / "__init__.py").touch()
     return folder

@@ -1,6 +1,6 @@
 """Small episodes made by hand: a ball rolls over a plate, and every point lies on one of the two."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import pytest
 
 from flowlab.cli import main
 from flowlab.geometry.camera import Camera
+from flowlab.provenance import Provenance
 from flowlab.records import Entity, Episode, PositionSource, Quality, Queries, Role, Tracks3D
 from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarize
@@ -83,12 +84,30 @@ def make_receipt(episodes: Sequence[Episode], **changes: Any) -> Receipt:
     return Receipt(**{**values, **changes})
 
 
+def make_provenance(settings: Mapping[str, Any] = SETTINGS, **changes: Any) -> Provenance:
+    """What the built-in stages of these settings would say: simulated by MetaWorld where an expert is among them."""
+    values: dict[str, Any] = {
+        "kind": "recorded",
+        "world_frame": "z up",
+        "camera": CAMERA.to_json(),
+        "observer": settings.get("observer"),
+        "queries": settings.get("queries"),
+        "tracks": "exact",
+    }
+    if "track" in settings:
+        values |= {"tracks": "estimated", "tracker": settings["track"].get("tracker", "rigid-bodies")}
+    if "expert" in settings:
+        from flowlab.sim.simulation import SceneSettings, describe_scene
+
+        values |= describe_scene(SceneSettings.model_validate(settings["expert"].get("scene", {})))
+    return Provenance(**{**values, **changes})
+
+
 def make_manifest(requested: dict[str, int], **changes: Any) -> Manifest:
     values: dict[str, Any] = {
         "recipe": "by-hand",
         "settings": SETTINGS,
-        "camera": CAMERA.to_json(),
-        "world_frame": "z up",
+        "provenance": make_provenance(changes.get("settings", SETTINGS)),
         "first_seed": 0,
         "requested": requested,
     }

@@ -30,7 +30,7 @@ def info(dataset: Path, as_json: bool) -> None:
         "frames": sum(ref.frames for ref in data.refs),
         "megabytes": round(folder_size(dataset) / 1e6, 2),
         "missing": data.missing,
-        "world_frame": data.manifest.world_frame,
+        "world_frame": data.manifest.provenance.world_frame,
     }
     manifest = json.loads(data.manifest.model_dump_json())
     if as_json:

@@ -137,11 +137,12 @@ def choose_pixels(first: Frame, task: str, settings: SimulatedRecording) -> Int[
         if count > 0 and kind.any():
             part = replace(cloud, xyz_world=cloud.xyz_world[kind], pixel=cloud.pixel[kind], owner=cloud.owner[kind])
             queries = sample_queries(part, QuerySettings(points=count))
-            chosen.append(queries.xyz_world[: queries.count])
+            assert queries.pixel is not None
+            chosen.append(queries.pixel[: queries.count])
     if not chosen:
         raise DataError(f"{task}: no point of the first frame lies in the crop; set observer.crop")
-    uv, _ = first.camera.project(np.concatenate(chosen))
-    pixel = np.rint(uv).astype(np.int64)
+    v, u = np.divmod(np.concatenate(chosen).astype(np.int64), first.camera.width)
+    pixel = np.stack([u, v], -1)
     _, where = np.unique(pixel, axis=0, return_index=True)
     return pixel[np.sort(where)]
 

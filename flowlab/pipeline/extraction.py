@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.engines.local import Engine, StartEngine, UnitResult
-from flowlab.errors import FlowlabError, UnfinishedError
+from flowlab.errors import FlowlabError, MissingFileError, UnfinishedError
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, SeedScheduler, UnitScheduler
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
@@ -22,29 +22,18 @@ from flowlab.storage.schema import SCHEMA
 
 __all__ = ["ExtractionProgress", "estimate", "extract", "fill", "manifest_for", "run_all"]
 
-_WORLD_FRAMES = {
-    "flowlab": "MetaWorld's own: z up, table top at z = 0 in most tasks, the robot's base at the origin facing +y",
-    "dp3": "DP3's: centerd at the camera and turned about 130 degrees about z; robot state stays in MetaWorld's",
-}
 _SECONDS_BETWEEN_SUMMARIES = 5.0
 
 
 def manifest_for(recipe: Recipe, tasks: tuple[str, ...]) -> Manifest:
     """The manifest of the dataset a recipe makes."""
-    from flowlab.pipeline.stages.simulation import ExpertStage  # recordings need no simulator
-    from flowlab.sim.recorder import TaskSimulator
-
-    expert = next((s for s in recipe.stages if isinstance(s, ExpertStage)), None)
-    if expert is None:
-        raise FlowlabError(f"recipe {recipe.name}: extract-sim needs an 'expert' stage at the start")
-    rollout = TaskSimulator(tasks[0], expert.scene).record_expert(
-        recipe.first_seed, expert.model_copy(update={"max_steps": 1})
-    )
+    provenance = recipe.pipeline().provenance(tasks[0])
+    if not provenance.is_simulated:
+        raise FlowlabError(f"recipe {recipe.name}: extract-sim needs a stage that simulates at the start, as 'expert'")
     return Manifest(
         recipe=recipe.name,
         settings=recipe.settings(),
-        camera=rollout.camera.to_json(),
-        world_frame=_WORLD_FRAMES[expert.scene.convention],
+        provenance=provenance,
         first_seed=recipe.first_seed,
         requested=dict.fromkeys(tasks, recipe.episodes),
     )
@@ -90,13 +79,17 @@ def fill(
     try:
         manifest = begin(folder, manifest)
         log.unlink(missing_ok=True)
+    except MissingFileError:
+        raise
     except OSError as error:
         raise _storage_error(folder, error) from error
-    work = partial(run_unit, recipe.model_dump_json(), manifest.settings_digest, folder)
+    work = partial(run_unit, recipe.model_dump_json(), recipe.folder, manifest.settings_digest, folder)
     try:
         with start_engine(work) as engine:
             failures = run_all(engine, plan_for(manifest), folder, share, report)
         dataset = summarize(folder)
+    except MissingFileError:
+        raise
     except OSError as error:
         raise _storage_error(folder, error) from error
     except BaseException:
@@ -122,9 +115,8 @@ def estimate(recipe: Recipe, tasks: tuple[str, ...], folder: Path, workers: int)
         start = time.process_time()
         episode = pipeline.run(request)
     except Rejected as rejected:
-        stage, reason = rejected.args
         raise FlowlabError(
-            f"{request.task} seed {request.seed} is rejected at {stage} ({reason}): no estimate"
+            f"{request.task} seed {request.seed} is rejected at {rejected.stage} ({rejected}): no estimate"
         ) from rejected
     seconds = time.process_time() - start
     have = Counter(task for r in read_receipts(folder) for task in [r.task] * len(r.accepted))

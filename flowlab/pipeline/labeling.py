@@ -24,10 +24,6 @@ from flowlab.storage.manifest import Manifest, Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
 from flowlab.tracking.base import make_tracker
 
-WORLD_FRAME = (
-    "each recording's own, as its T_world_cam says; where that is the identity, the axes of its camera: "
-    "x right, y down, z forward"
-)
 _TRIAL_FRAMES = 33
 """As many frames are labeled to tell what all will cost."""
 
@@ -79,8 +75,7 @@ def label_recordings(
     manifest = Manifest(
         recipe=recipe.name,
         settings=recipe.settings(),
-        camera={},
-        world_frame=WORLD_FRAME,
+        provenance=recipe.pipeline().provenance(recordings[0].task if recordings else ""),
         first_seed=0,
         requested=dict(Counter(r.task for r in recordings)),
         recordings=tuple(recordings),
@@ -97,9 +92,8 @@ def label_recordings(
 
 def _forget_unopened(folder: Path, seeds: set[int]) -> None:
     """Remove the receipts of recordings that could not be opened: their users were told how to mend them."""
-    opening = RecordingStage.model_fields["stage"].default
     for receipt in read_receipts(folder):
-        if receipt.rejects and seeds.issuperset(receipt.seeds) and all(x.stage == opening for x in receipt.rejects):
+        if receipt.rejects and seeds.issuperset(receipt.seeds) and all(x.retry for x in receipt.rejects):
             (folder / "receipts" / f"{receipt.unit}.json").unlink(missing_ok=True)
 
 

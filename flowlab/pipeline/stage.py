@@ -2,24 +2,31 @@
 
 import time
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
 from flowlab.config import Settings
-from flowlab.errors import UsageError
+from flowlab.errors import FlowlabError, UsageError
+from flowlab.provenance import Provenance
 from flowlab.records import Demonstration, Episode
 from flowlab.storage.manifest import StageTally
 
 
-class Rejected(Exception):
-    """Raised by a stage that will not let a record pass; the message is the reason that is kept.
+class Rejected(FlowlabError):
+    """Raised by a stage that will not let a record pass; the reason is kept in the dataset.
 
-    A stage that gives the episode too keeps it for people to look at.
+    Args:
+        reason: What was found, what was expected, and what to do about it.
+        episode: The episode, where there is one that people may look at; it is kept beside the dataset's own.
+        retry: Whether the cause lies outside the dataset, as that of a recording that cannot be opened: the same
+            command tries again.
+        stage: Name of the stage; the pipeline fills it in.
     """
 
-    def __init__(self, *about: str, episode: Episode | None = None) -> None:
-        super().__init__(*about)
-        self.episode = episode
+    def __init__(self, reason: str, *, episode: Episode | None = None, retry: bool = False, stage: str = "") -> None:
+        super().__init__(reason)
+        self.reason, self.episode, self.retry, self.stage = reason, episode, retry, stage
 
 
 class Stage(Settings):
@@ -37,6 +44,18 @@ class Stage(Settings):
     def process(self, record: Any) -> Any:
         """Turn a record into the next; raise :class:`Rejected` to keep it out of the dataset."""
         raise NotImplementedError
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """What is known of a dataset's episodes after this stage, given what was known before it.
+
+        Args:
+            provenance: What the stages before this one have said.
+            task: One of the dataset's tasks, the same for all stages.
+
+        Returns:
+            The same with what this stage knows: ``provenance.model_copy(update={...})``.
+        """
+        return provenance
 
     @classmethod
     def takes(cls) -> type:
@@ -90,8 +109,12 @@ class Pipeline:
         assert isinstance(last, Writer)
         self.writer = last
 
+    def provenance(self, task: str) -> Provenance:
+        """Where the episodes that this pipeline makes come from, and what their numbers mean, as its stages say."""
+        return reduce(lambda known, stage: stage.describe(known, task), self.stages, Provenance())
+
     def run(self, request: EpisodeRequest) -> Episode:
-        """Make one episode. Raises :class:`Rejected` with the stage's name and its reason as arguments."""
+        """Make one episode. Raises :class:`Rejected`, which names the stage that did not let it pass."""
         record: Any = request
         for stage in self.stages:
             record = self._process(stage, record)
@@ -110,7 +133,8 @@ class Pipeline:
             return stage.process(record)
         except Rejected as rejected:
             rejects = 1
-            raise Rejected(stage.stage, str(rejected), episode=rejected.episode) from rejected
+            rejected.stage = stage.stage
+            raise
         finally:
             self._count(stage, StageTally(calls=1, cpu_s=time.process_time() - start, rejects=rejects))
 

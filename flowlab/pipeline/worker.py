@@ -15,9 +15,19 @@ from flowlab.storage.manifest import Receipt, Reject
 from flowlab.storage.shard import episode_digest
 
 
-def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUnit) -> Receipt:
-    """Make the episodes of a unit, write them into its shard, and its receipt beside them."""
-    pipeline = _pipeline(recipe_json)
+def run_unit(
+    recipe_json: str, stages_folder: Path | None, settings_digest: str, folder: Path, unit: WorkUnit
+) -> Receipt:
+    """Make the episodes of a unit, write them into its shard, and its receipt beside them.
+
+    Args:
+        recipe_json: The recipe, as JSON.
+        stages_folder: Where the modules of its own stages may lie.
+        settings_digest: Identifies its settings; the shard says it.
+        folder: Of the dataset.
+        unit: What is to be made.
+    """
+    pipeline = _pipeline(recipe_json, stages_folder)
     before = dict(pipeline.tallies)
     episodes: list[Episode] = []
     rejects: list[Reject] = []
@@ -26,13 +36,13 @@ def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUni
         try:
             episodes.append(pipeline.run(request))
         except Rejected as rejected:
-            stage, reason = rejected.args
             position = None
             if rejected.episode is not None:
                 position = len(kept)
                 kept.append(pipeline.writer.process(rejected.episode))
             about = request.model_dump()
-            rejects.append(Reject(**about, stage=stage, reason=reason, position=position))
+            why = {"stage": rejected.stage, "reason": rejected.reason, "retry": rejected.retry}
+            rejects.append(Reject(**about, **why, position=position))
     for place, found in ("shards", episodes), ("rejects", kept):
         _store(pipeline, folder / place / f"{unit.name}.zarr", found, settings_digest)
     receipt = Receipt(
@@ -60,5 +70,5 @@ def _store(pipeline: Pipeline, path: Path, episodes: list[Episode], settings_dig
 
 
 @lru_cache(maxsize=1)
-def _pipeline(recipe_json: str) -> Pipeline:
-    return parse_recipe(recipe_json, "recipe").pipeline()
+def _pipeline(recipe_json: str, stages_folder: Path | None) -> Pipeline:
+    return parse_recipe(recipe_json, "recipe", folder=stages_folder).pipeline()

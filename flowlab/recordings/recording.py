@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Recording(Demonstration):
     """A recording of a real robot. Row t is a color picture, with the depth picture nearest in time.
 

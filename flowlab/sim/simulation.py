@@ -2,19 +2,20 @@
 
 import warnings
 from functools import partial
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import metaworld
 import mujoco
 import numpy as np
 from jaxtyping import Float32
 from metaworld import policies
-from pydantic import Field
+from pydantic import Field, PlainSerializer
 
 from flowlab.config import Settings
 from flowlab.errors import unknown_name
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import inverse, rigid
+from flowlab.provenance import Channels
 from flowlab.sim.scene import Poses, Scene
 from flowlab.sim.tasks import find_task
 
@@ -48,10 +49,39 @@ class SceneSettings(Settings):
     """Also take color pictures; needs ``gl``."""
     markers: bool = True
     """Draw goal markers. In reach, push and pick-place they are all that shows the goal."""
-    hidden_bodies: frozenset[str] = frozenset()
+    hidden_bodies: Annotated[frozenset[str], PlainSerializer(sorted)] = frozenset()
     """Bodies not to draw."""
     convention: Literal["flowlab", "dp3"] = "flowlab"
-    """``dp3`` reproduces DP3's camera: its rotated, camera-centerd frame and its half-pixel shift."""
+    """``dp3`` reproduces DP3's camera: its rotated, camera-centered frame and its half-pixel shift."""
+
+
+_WORLD_FRAMES = {
+    "flowlab": "MetaWorld's own: z up, table top at z = 0 in most tasks, the robot's base at the origin facing +y",
+    "dp3": "DP3's: centered at the camera and turned about 130 degrees about z; robot state stays in MetaWorld's",
+}
+
+
+def describe_scene(settings: SceneSettings) -> dict[str, Any]:
+    """What the episodes of a scene are and what their numbers mean: all of their
+    :class:`~flowlab.provenance.Provenance` that does not depend on the camera's model."""
+    frame = "simulator" if settings.convention == "dp3" else "world"  # DP3 turns the clouds, and not the state
+    position, displacement = {"kind": "position", "unit": "m"}, {"kind": "displacement", "unit": "cm"}
+    return {
+        "kind": "simulated",
+        "simulator": "metaworld",
+        "scene": settings.model_dump(mode="json"),
+        "world_frame": _WORLD_FRAMES[settings.convention],
+        "state": (
+            Channels(name="hand", index=(0, 1, 2), frame=frame, **position),
+            Channels(name="right finger", index=(3, 4, 5), frame=frame, **position),
+            Channels(name="left finger", index=(6, 7, 8), frame=frame, **position),
+        ),
+        "action": (
+            Channels(name="hand", index=(0, 1, 2), frame=frame, **displacement),
+            Channels(name="gripper", index=(3,), kind="effort", frame="", unit="1"),
+        ),
+        "action_limits": ((-1.0,) * ACTION_SIZE, (1.0,) * ACTION_SIZE),
+    }
 
 
 class Simulation:
@@ -185,7 +215,7 @@ _DP3_TURN = np.array([[0.992546, 0, -0.121869], [0.106999, 0.478692, 0.871439], 
 def dp3_camera(camera: Camera) -> tuple[Camera, np.ndarray]:
     """The camera as DP3 takes it to be, and T_dp3_world from MuJoCo's world to DP3's frame.
 
-    DP3 reads the pose of another camera, whose rotation is the identity, so its frame is centerd at the
+    DP3 reads the pose of another camera, whose rotation is the identity, so its frame is centered at the
     camera and turned by constants; and its intrinsics put the image center half a pixel off.
     """
     T_dp3_cam = rigid(_DP3_TURN @ _GL_TO_CV, np.zeros(3))

@@ -47,7 +47,7 @@ def dataset_card(manifest: Manifest, receipts: Sequence[Receipt], stats: dict[st
     return _CARD.format(
         recipe=manifest.recipe,
         version=manifest.flowlab,
-        world_frame=manifest.world_frame,
+        world_frame=manifest.provenance.world_frame,
         episodes=stats["episodes"],
         frames=stats["frames"],
         tasks="\n".join(rows),
@@ -64,7 +64,7 @@ def _quality(manifest: Manifest, quality: dict[str, Any]) -> str:
     """What the card says of tracks that were estimated."""
     sigma = quality["visible_sigma_m"]
     return _QUALITY.format(
-        tracker=manifest.settings.get("track", {}).get("tracker", "unknown"),
+        tracker=manifest.provenance.tracker or "unknown",
         p50=sigma["p50"] * 1e3,
         p90=sigma["p90"] * 1e3,
         visible=quality["visible_share"],

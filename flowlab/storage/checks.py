@@ -1,12 +1,12 @@
 """What can be wrong with the content of an episode."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flowlab.provenance import Provenance
 from flowlab.records import Episode, PositionSource
 from flowlab.storage.schema import SCHEMA
 
@@ -34,8 +34,8 @@ class Problem:
     what: str
 
 
-def episode_problems(e: Episode, settings: Mapping[str, Any]) -> Iterator[Problem]:
-    """Everything wrong with an episode that was made with these settings."""
+def episode_problems(e: Episode, provenance: Provenance) -> Iterator[Problem]:
+    """Everything wrong with an episode that comes from where ``provenance`` says."""
     for spec in SCHEMA:
         values = spec.of(e) if spec.dtype.startswith("float") else None
         if values is not None and not np.isfinite(values).all():
@@ -44,10 +44,22 @@ def episode_problems(e: Episode, settings: Mapping[str, Any]) -> Iterator[Proble
             return
     for check in _CHECKS:
         yield from check(e)
-    if "track" in settings and e.tracks.quality is None:
+    if provenance.tracks == "estimated" and e.tracks.quality is None:
         yield Problem("data/sigma", "missing; estimated tracks must state their error")
-    if "expert" in settings and np.abs(e.action).max() > 1:
-        yield Problem("data/action", f"reaches {np.abs(e.action).max():.3g}; actions as executed lie in [-1, 1]")
+    if provenance.action_limits is not None:
+        yield from _beyond_limits(e.action, *map(np.array, provenance.action_limits))
+
+
+def _beyond_limits(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[Problem]:
+    """Actions as executed lie within their limits."""
+    if action.shape[1] != len(low):
+        yield Problem("data/action", f"has {action.shape[1]} numbers a step, and limits are known of {len(low)}")
+        return
+    beyond = np.maximum(action - high, low - action)
+    t, k = np.unravel_index(beyond.argmax(), beyond.shape)
+    if beyond[t, k] > 0:
+        limits = f"[{low[k]:g}, {high[k]:g}]"
+        yield Problem("data/action", f"reaches {action[t, k]:.3g} at step {t}; actions as executed lie in {limits}")
 
 
 def _teleports(e: Episode) -> Iterator[Problem]:

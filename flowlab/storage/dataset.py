@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, MissingFileError
 from flowlab.files import locked, remove_leftovers, write_atomically, write_json
 from flowlab.records import Episode
 from flowlab.storage import stats
@@ -54,7 +54,7 @@ class Dataset:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         if not self.path.exists():
-            raise DataError(f"{self.path}: there is no such folder")
+            raise MissingFileError(f"{self.path}: there is no such folder")
         self.manifest = Manifest.read(self.path)
         self.receipts = read_receipts(self.path)
 
@@ -182,7 +182,7 @@ def _check_settings(folder: Path, old: Manifest, manifest: Manifest) -> None:
     mine = json.loads(manifest.model_dump_json())
     theirs = json.loads(old.model_dump_json())
     for values in (theirs, mine):
-        values["stages"] = list(values["settings"])
+        values |= {"stages": list(values["settings"]), "camera": values["provenance"]["camera"]}
     compared = ("stages", "settings", "first_seed", "camera")
     lines = list(differences({k: theirs[k] for k in compared}, {k: mine[k] for k in compared}))
     if lines:

@@ -12,6 +12,7 @@ from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.files import read_json
 from flowlab.provenance import Provenance
+from flowlab.storage.migrations import migrate_manifest, migrate_receipt
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.version import __version__
@@ -34,22 +35,23 @@ class Manifest(Settings):
     """Name of the recipe."""
     settings: Mapping[str, Any]
     """Every setting of every stage, by stage name."""
-    camera: Mapping[str, Any]
-    """K [px] and T_world_cam, see :class:`flowlab.geometry.Camera`; empty where every recording has its own."""
-    world_frame: str
     units: Mapping[str, str] = UNITS
     first_seed: int
     requested: Mapping[str, int]
     """Episodes asked for, by task."""
-    provenance: Provenance = Provenance()
+    provenance: Provenance
     """Where the episodes come from, and what their numbers mean."""
     recordings: tuple[Recorded, ...] = ()
     """What the episodes are made from, where that is no simulation."""
+    first_settings_digest: str = ""
+    """Of a dataset that an earlier flowlab began: what its shards call the settings; empty in others."""
 
     @property
     def settings_digest(self) -> str:
-        """Identifies the settings; every shard carries it."""
-        stages = list(json.loads(self.model_dump_json())["settings"].items())  # in order, which matters too
+        """Identifies the settings of the stages, in their order, whatever the stages are called; every shard has it."""
+        if self.first_settings_digest:
+            return self.first_settings_digest
+        stages = list(json.loads(self.model_dump_json())["settings"].values())
         return hashlib.sha256(json.dumps(stages, sort_keys=True).encode()).hexdigest()[:16]
 
     @classmethod
@@ -66,7 +68,7 @@ class Manifest(Settings):
                 "use the flowlab version that wrote it"
             )
         try:
-            return cls.model_validate(values)
+            return cls.model_validate(migrate_manifest(values))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"]))
@@ -84,6 +86,8 @@ class Reject(Settings):
     """Path of the recording."""
     position: int | None = None
     """Index of the episode within the shard of its unit's rejects; None where there is nothing to look at."""
+    retry: bool = False
+    """Whether the next run tries again, since the cause lies outside the dataset: a recording could not be opened."""
 
 
 class StageTally(Settings):
@@ -150,7 +154,7 @@ def read_receipts(folder: Path) -> list[Receipt]:
         if path.name.startswith("."):
             continue
         try:
-            receipts.append(Receipt.model_validate(read_json(path)))
+            receipts.append(Receipt.model_validate(migrate_receipt(read_json(path))))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"])) or "lists"

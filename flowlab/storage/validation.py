@@ -1,13 +1,13 @@
 """Everything that would spoil training on a dataset, found before it does."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from flowlab.errors import DataError
+from flowlab.provenance import Provenance
 from flowlab.storage.checks import Problem, episode_problems
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import MANIFEST, Receipt
@@ -100,7 +100,7 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard) -> Iterator[F
             problems = True
             yield _finding(shard.path, error)
     ends = shard.array(EPISODE_ENDS)
-    for problem in [] if problems else _shape_problems(dataset.manifest.settings, columns, ends):
+    for problem in [] if problems else _shape_problems(dataset.manifest.provenance, columns, ends):
         problems = True
         yield _under(place, problem)
     if problems:
@@ -112,19 +112,19 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard) -> Iterator[F
         yield Finding(place, f"holds (task, seed, frames) {held}, its receipt says {told}; {_ANEW}")
         return
     for episode, digest in zip(episodes, receipt.digests, strict=True):
-        for problem in episode_problems(episode, dataset.manifest.settings):
+        for problem in episode_problems(episode, dataset.manifest.provenance):
             yield _under(place, problem, f"seed {episode.seed}: ")
         if episode_digest(episode) != digest:
             yield Finding(place, f"seed {episode.seed}: content differs from what its receipt says; {_ANEW}")
 
 
-def _shape_problems(settings: Mapping[str, Any], columns: dict[str, np.ndarray], ends: np.ndarray) -> Iterator[Problem]:
-    """Types and shapes against the schema, the settings and each other."""
+def _shape_problems(known: Provenance, columns: dict[str, np.ndarray], ends: np.ndarray) -> Iterator[Problem]:
+    """Types and shapes against the schema, the provenance and each other."""
     if len(ends) == 0 or (np.diff(ends, prepend=0) <= 0).any():
         yield Problem(EPISODE_ENDS, f"must rise from above 0, found {ends.tolist()[:8]}")
         return
     sizes = {"time": int(ends[-1]), "episode": len(ends), "xyz": 3, "rgb": 3, "pose": 9}
-    sizes |= {dim: settings[stage]["points"] for dim, stage in _SIZE_OF.items() if stage in settings}
+    sizes |= {dim: made["points"] for dim, made in (("point", known.observer), ("query", known.queries)) if made}
     for spec in SCHEMA:
         if spec.path not in columns:
             continue
@@ -134,7 +134,3 @@ def _shape_problems(settings: Mapping[str, Any], columns: dict[str, np.ndarray],
         expected = tuple(sizes.setdefault(dim, n) for dim, n in zip(spec.dims, values.shape, strict=False))
         if values.shape != expected or len(values.shape) != len(spec.dims):
             yield Problem(spec.path, f"shape is {values.shape}, expected {expected} for {', '.join(spec.dims)}")
-
-
-_SIZE_OF = {"point": "observer", "query": "queries"}
-"""Dimensions whose size is the setting ``points`` of a stage."""

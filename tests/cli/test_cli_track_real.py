@@ -240,8 +240,12 @@ def test_short_options_are_settings(recordings: Path, tmp_path: Path, capsys: py
 MISTAKES = {
     "no path": ("--out x", 2, "PATH"),
     "no out": ("rec", 2, "--out data/pour; or look first with --dry-run"),
-    "unknown tracker": ("rec --out x --tracker bodie", 2, "no tracker is called 'bodie'; did you mean bodies"),
-    "unknown tracker, dry": ("rec --dry-run --tracker bodie", 2, "no tracker is called 'bodie'"),
+    "unknown tracker": (
+        "rec --out x --tracker rigid-bodie",
+        2,
+        "no tracker is called 'rigid-bodie'; did you mean rigid-bodies",
+    ),
+    "unknown tracker, dry": ("rec --dry-run --tracker rigid-bodie", 2, "no tracker is called 'rigid-bodie'"),
     "unknown option": (
         "rec --out x --tracker lucas-kanade --set track.options.windw=3",
         2,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import Cli
-from synthetic import SETTINGS, call_cli, files_below, make_dataset, make_episode, make_manifest
+from synthetic import SETTINGS, call_cli, files_below, make_dataset, make_episode, make_manifest, make_provenance
 from trained_runs import (
     NETWORK,
     SMALL,
@@ -28,6 +28,7 @@ from trained_runs import (
 
 from flowlab.storage.dataset import begin
 from flowlab.storage.recorded import Recorded
+from flowlab.training import distributed
 
 Capture = pytest.CaptureFixture[str]
 KEPT = ["policy.json", "run.json", "metrics.jsonl", "curve.png", "resume.safetensors"]
@@ -200,7 +201,8 @@ def test_recordings_train_with_actions_that_are_places(tmp_path: Path, capsys: C
     table = tuple(Recorded(task="pour", name=f"take-{k}", seed=k, source=f"/rec/take-{k}") for k in range(4))
     about: dict[str, Any] = {"recording": {"reader": "plain"}, **SETTINGS, "track": {"tracker": "rigid-bodies"}}
     make_dataset(
-        tmp_path / "d", [[make_recorded(k) for k in range(4)]], settings=about, recordings=table, camera={},
+        tmp_path / "d", [[make_recorded(k) for k in range(4)]], settings=about, recordings=table,
+        provenance=make_provenance(about, camera={}),
         recipe="real",
     )  # fmt: skip
     code, _, err = call_cli(capsys, "train", tmp_path / "d", "--policy", "fdp", "--out", tmp_path / "run", *SMALL)
@@ -373,7 +375,7 @@ def test_bf16_is_refused_where_it_would_be_slower(
     rolls: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
 
-    monkeypatch.setattr(processes, "has_bf16", lambda device: False)
+    monkeypatch.setattr(distributed, "has_bf16", lambda device: False)
     small = ("train", rolls, "--policy", "dp3", *SMALL, "--device", "cpu")
     code, out, err = call_cli(capsys, *small, "--out", tmp_path / "a", "--precision", "bf16")
     assert (code, out) == (2, "")

@@ -77,9 +77,9 @@ def rolled_out(policy: PolicyNetwork, stage: SimulatorPool) -> Attempt:
 def test_a_control_loop_acts_as_a_rollout_does(stage: SimulatorPool, name: str) -> None:
     policy = network(name)
     attempt = rolled_out(policy, stage)
-    driven = drive(Policy(policy, "hammer", seed=TRIAL.layout), stage, TRIAL.layout)
+    driven = drive(Policy(policy, "hammer", seed=TRIAL.scene_seed), stage, TRIAL.scene_seed)
     np.testing.assert_allclose(np.clip(driven[:8], -1, 1), attempt.rollout.action[:8], atol=1e-4)
-    other = drive(Policy(policy, "hammer", seed=TRIAL.layout + 1), stage, TRIAL.layout)
+    other = drive(Policy(policy, "hammer", seed=TRIAL.scene_seed + 1), stage, TRIAL.scene_seed)
     assert np.abs(other[:8] - driven[:8]).max() > 1e-2, "the noise is the seed's"
 
 
@@ -88,7 +88,7 @@ def test_every_plan_of_a_control_loop_is_decided_on_what_a_rollout_shows(stage: 
     policy.fixed, policy.seen = True, []
     rolled_out(policy, stage)
     rolled, policy.seen = policy.seen, []
-    drive(Policy(policy, "hammer", seed=TRIAL.layout), stage, TRIAL.layout)
+    drive(Policy(policy, "hammer", seed=TRIAL.scene_seed), stage, TRIAL.scene_seed)
     assert len(rolled) == len(policy.seen) == 3
     for theirs, mine in zip(rolled, policy.seen, strict=True):
         lane = TRIAL.episode % BATCH_SLOTS

@@ -81,7 +81,7 @@ def only(attempts: Sequence[Attempt]) -> Attempt:
 
 
 @pytest.mark.parametrize(
-    ("name", "n_obs_steps", "n_action_steps"),
+    ("name", "history", "n_action_steps"),
     [("dp3", 2, 8), ("fdp", 2, 8), ("fdp", 2, 1), ("dp3", 1, 8), ("dp3", 3, 2)],
 )
 def test_repeating_the_expert_solves_the_task_at_the_same_step_and_shows_the_dataset(
@@ -260,7 +260,7 @@ def test_only_what_a_plan_looks_at_is_taken_and_that_changes_nothing(
 
 
 def test_what_was_foreseen_is_the_plans_flow_from_the_present_on(hammer: SimulatorPool) -> None:
-    policy = repeater("fdp", "hammer", n_obs_steps=3)
+    policy = repeater("fdp", "hammer", history=3)
     policy.follow(np.zeros((1, 4), np.float32), 8)
     flow = torch.arange(BATCH_SLOTS * HORIZON * 20 * 3, dtype=torch.float32).view(BATCH_SLOTS, HORIZON, 20, 3)
 

@@ -138,7 +138,7 @@ def test_a_dataset_of_recordings_is_sound(dataset: Dataset) -> None:
     assert [(r.task, r.name, r.seed) for r in dataset.manifest.recordings] == [
         ("slide", "take 1", 0), ("slide", "take 2", 1), ("slide", "take 10", 2),
     ]  # fmt: skip
-    assert dataset.manifest.camera == {}
+    assert dataset.manifest.provenance.camera == {}
     assert 0 < dataset.stats["quality"]["visible_sigma_m"]["p50"] < 0.05
     assert "by the tracker `lucas-kanade`" in (dataset.path / "README.md").read_text()
 

@@ -76,7 +76,7 @@ def run_all(pipeline: Pipeline, seeds: Sequence[int]) -> tuple[list[Episode], di
         try:
             episodes.append(pipeline.run(EpisodeRequest(task="roll", seed=seed)))
         except Rejected as error:
-            rejected[seed] = error.args
+            rejected[seed] = error.stage, str(error)
     return episodes, rejected
 
 
@@ -165,7 +165,7 @@ def test_what_was_rejected_with_its_episode_can_be_looked_at(tmp_path: Path) -> 
     (tmp_path / "receipts").mkdir()
     unit = WorkUnit(task="roll", seeds=(0, 1, 2, 3), sources=("/a", "/b", "/c", "/d"))
     begin(tmp_path, make_manifest({"roll": 4}))
-    receipt = run_unit(STAGES_HERE % "Kept", "digest", tmp_path, unit)
+    receipt = run_unit(STAGES_HERE % "Kept", None, "digest", tmp_path, unit)
     assert receipt.accepted == (0, 2)
     assert [(x.seed, x.stage, x.reason, x.source, x.position) for x in receipt.rejects] == [
         (1, "test_pipeline:Kept", "1 is odd", "/b", 0), (3, "test_pipeline:Kept", "3 is odd", "/d", 1),
@@ -180,11 +180,11 @@ def test_a_second_try_at_a_unit_leaves_nothing_of_the_first(tmp_path: Path) -> N
     """Its recording was mended, or its rules were changed: a shard that its receipt knows nothing of must not stay."""
     (tmp_path / "receipts").mkdir()
     unit = WorkUnit(task="roll", seeds=(1,))
-    run_unit(STAGES_HERE % "Kept", "digest", tmp_path, unit)
+    run_unit(STAGES_HERE % "Kept", None, "digest", tmp_path, unit)
     assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["rejects"]
-    run_unit(STAGES_HERE % "AsItIs", "digest", tmp_path, unit)
+    run_unit(STAGES_HERE % "AsItIs", None, "digest", tmp_path, unit)
     assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["shards"]
-    run_unit(STAGES_HERE % "OnlyEven", "digest", tmp_path, unit)
+    run_unit(STAGES_HERE % "OnlyEven", None, "digest", tmp_path, unit)
     assert list(tmp_path.glob("*/*.zarr")) == []
 
 
@@ -255,7 +255,7 @@ def test_a_real_rejection_names_the_stage() -> None:
     pipeline = recipe.pipeline()
     with pytest.raises(Rejected) as rejected:
         pipeline.run(EpisodeRequest(task="drawer-open", seed=0))
-    stage, reason = rejected.value.args
+    stage, reason = rejected.value.stage, str(rejected.value)
     assert stage == "observer"
     assert reason.startswith("step 0: drawer-open: no point of the frame lies in the crop")
     counts = {name: (t.calls, t.rejects) for name, t in pipeline.tallies.items()}

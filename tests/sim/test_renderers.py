@@ -386,8 +386,8 @@ SCRIPT = """
 import sys
 from flowlab.errors import MissingLibraryError
 from flowlab.sim.simulation import SceneSettings
-from flowlab.sim.recorder import ExpertSettings, Studio
-studio = Studio("reach", SceneSettings(renderer="gl"))
+from flowlab.sim.recorder import ExpertSettings, TaskSimulator
+studio = TaskSimulator("reach", SceneSettings(renderer="gl"))
 try:
     frame = studio.record_expert(0, ExpertSettings(max_steps=1)).frame(0)
 except MissingLibraryError as error:

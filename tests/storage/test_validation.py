@@ -157,7 +157,7 @@ HARMS = {
     "tracks frozen": Harm(relabel(frozen), TRACKS, OFF_SURFACE),
     "loose anchor": Harm(relabel(loose_anchor), TRACKS, "1.73 mm from where it was anchored"),
     "impossible count": Harm(relabel(impossible_count), f"{SHARD}/data/point_count", "from 1025 to 1025, not"),
-    "action beyond 1": Harm(relabel(too_far), f"{SHARD}/data/action", "seed 1: reaches 1.5"),
+    "action beyond 1": Harm(relabel(too_far), f"{SHARD}/data/action", "seed 1: reaches -1.5"),
     "plausible, but changed": Harm(
         relabel(moved((0, 0, 1e-6)), receipt_too=False), SHARD, "seed 1: content differs from what its receipt says"
     ),

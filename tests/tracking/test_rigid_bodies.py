@@ -15,7 +15,7 @@ from flowlab.testing.trackers import check_tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.labeling import label_clip
 from flowlab.tracking.lifting import LiftSettings
-from flowlab.tracking.trackers.rigid_bodies import Bodies, _kernels
+from flowlab.tracking.trackers.rigid_bodies import RigidBodies, _kernels
 from flowlab.tracking.trackers.rigid_bodies.features import extract_features
 from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, best_rigid
 
@@ -51,7 +51,7 @@ def errors(
     scene: list[moving_planes.Plate], clip: Clip, owner: np.ndarray, xy: np.ndarray
 ) -> tuple[np.ndarray, Tracks2D]:
     """Distance (T, M) [m] between labels and truth."""
-    tracks, labels = label_clip(clip, xy, Bodies(), ChunkSettings(), LiftSettings())
+    tracks, labels = label_clip(clip, xy, RigidBodies(), ChunkSettings(), LiftSettings())
     return np.linalg.norm(labels.xyz_world - moving_planes.paths(scene, clip, owner, xy), axis=-1), tracks
 
 
@@ -82,7 +82,7 @@ def test_a_hidden_point_is_carried_on_and_said_to_be_hidden() -> None:
     ]
     clip, owner = moving_planes.film(scene)
     xy = queries(owner, 1, count=12)
-    _, labels = label_clip(clip, xy, Bodies(), ChunkSettings(), LiftSettings())
+    _, labels = label_clip(clip, xy, RigidBodies(), ChunkSettings(), LiftSettings())
     truth = moving_planes.paths(scene, clip, owner, xy)
     uv, z = clip.camera.project(truth)
     j, i = np.rint(uv).astype(int).transpose(2, 0, 1)
@@ -137,7 +137,7 @@ def test_points_without_depth_are_followed_in_the_picture() -> None:
     xy = queries(owner, 1, count=10)
     hole = clip.depth.copy()
     hole[0, xy[0, 1].astype(int), xy[0, 0].astype(int)] = 0
-    tracks = Bodies().open(Clip(clip.rgb, hole, clip.camera)).track(np.insert(xy, 0, 0, axis=1), 0, FRAMES)
+    tracks = RigidBodies().open(Clip(clip.rgb, hole, clip.camera)).track(np.insert(xy, 0, 0, axis=1), 0, FRAMES)
     assert tracks.depth is not None
     assert tracks.forward_backward is not None
     assert (tracks.depth[:, 0] == 0).all()
@@ -150,7 +150,7 @@ def test_points_without_depth_are_followed_in_the_picture() -> None:
 def test_what_nothing_explains_is_followed_in_the_picture() -> None:
     clip, owner = moving_planes.film(two_plates())
     query = np.insert(queries(owner, 1, count=5), 0, 0, axis=1)
-    tracks = Bodies(unexplained=1e-6).open(clip).track(query, 0, FRAMES)
+    tracks = RigidBodies(unexplained=1e-6).open(clip).track(query, 0, FRAMES)
     assert tracks.depth is not None
     assert (tracks.depth == 0).all()
 
@@ -158,13 +158,13 @@ def test_what_nothing_explains_is_followed_in_the_picture() -> None:
 def test_same_seed_same_tracks() -> None:
     clip, owner = moving_planes.film(two_plates(), noise=0.003)
     query = np.insert(np.concatenate([queries(owner, k, 6) for k in range(3)]), 0, 0, axis=1)
-    one, other = (Bodies(seed=3).open(clip).track(query, 0, FRAMES) for _ in range(2))
+    one, other = (RigidBodies(seed=3).open(clip).track(query, 0, FRAMES) for _ in range(2))
     for field in fields(Tracks2D):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
 def test_keeps_the_contract_of_trackers() -> None:
-    check_tracker(Bodies)
+    check_tracker(RigidBodies)
 
 
 @given(

@@ -45,7 +45,7 @@ def read_wandb(file: Path) -> Iterator[Any]:
 
 def read_history(file: Path) -> dict[int, dict[str, float]]:
     """What a W&B file holds of each step, beside W&B's own."""
-    rows = [r.n_obs_steps for r in read_wandb(file) if r.WhichOneof("record_type") == "n_obs_steps"]
+    rows = [r.history for r in read_wandb(file) if r.WhichOneof("record_type") == "history"]
     named = {
         row.step.num: {i.key or "/".join(i.nested_key): json.loads(i.value_json) for i in row.item} for row in rows
     }
@@ -56,10 +56,10 @@ LOGGING = """
 import json, sys
 from pathlib import Path
 from flowlab.errors import FlowlabError
-from flowlab.training.loggers import make_log
+from flowlab.training.loggers import make_logger
 folder, settings, written = sys.argv[1], *map(json.loads, sys.argv[2:])
 try:
-    log = make_log("wandb", Path(folder), "push-fdp", settings)
+    log = make_logger("wandb", Path(folder), "push-fdp", settings)
 except FlowlabError as error:
     sys.exit(f"{type(error).__name__}: {error}")
 for step, values in written:
@@ -140,7 +140,7 @@ def test_wandb_keeps_what_was_logged(tmp_path: Path) -> None:
 def test_wandb_without_an_account_says_what_to_do(tmp_path: Path) -> None:
     code, said = log_to_wandb(tmp_path, "online", [])
     assert code == 1
-    assert said.startswith("LogRefused: --log wandb: No API key")
+    assert said.startswith("LoggerRefusedError: --log wandb: No API key")
     assert said.endswith("; type 'wandb login', or set WANDB_MODE=offline and 'wandb sync' later\n")
     assert not (tmp_path / "wandb-id.txt").exists()
 

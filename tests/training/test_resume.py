@@ -31,7 +31,7 @@ from trained_runs import (
 )
 
 from flowlab.policies.settings import load_settings
-from flowlab.training import run
+from flowlab.training import run as training_run
 
 Capture = pytest.CaptureFixture[str]
 STEPS = 130
@@ -146,22 +146,22 @@ def test_wherever_a_run_stops_nothing_is_lost(variant: str, rolls: Path, tmp_pat
     policy, profile, changes = VARIANTS[variant]
     small = [word for word in SMALL if word != "--set"] if profile == "fast" else []
     settings = load_settings(profile, policy, [*small, *changes, "run.minutes=null", "run.steps=30"])
-    machine = run.ComputeSettings(device="cpu")
+    machine = training_run.ComputeSettings(device="cpu")
     for name in ("unbroken", "broken"):
-        trainer = run.prepare_run(rolls, tmp_path / name, settings, machine)
+        trainer = training_run.prepare_run(rolls, tmp_path / name, settings, machine)
         if name == "broken":
             for steps in (1, 7, 12):
-                assert not run.run(trainer, lambda _: None, stop_after(steps))
-                trainer = run.resume_run(tmp_path / name)
+                assert not training_run.run(trainer, lambda _: None, stop_after(steps))
+                trainer = training_run.resume_run(tmp_path / name)
             assert trainer.step == 20
-        assert run.run(trainer, lambda _: None)
+        assert training_run.run(trainer, lambda _: None)
     check_same(tmp_path / "broken", tmp_path / "unbroken")
 
 
 def test_a_run_that_dies_at_once_can_be_resumed(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     """Before its first step, say while another program is asked to log."""
     settings = load_settings("fast", "dp3", [word for word in SMALL if word != "--set"])
-    run.prepare_run(rolls, tmp_path / "died", settings, run.ComputeSettings(device="cpu"))
+    training_run.prepare_run(rolls, tmp_path / "died", settings, training_run.ComputeSettings(device="cpu"))
     train(capsys, tmp_path / "died", "--resume")
     train(capsys, rolls, "--policy", "dp3", "--out", tmp_path / "whole", *SMALL, "--device", "cpu")
     check_same(tmp_path / "died", tmp_path / "whole")
@@ -213,8 +213,8 @@ def test_the_same_seed_gives_the_same_weights(rolls: Path, tmp_path: Path, capsy
 def stopped(rolls: Path, run: Path) -> Path:
     """A run that was stopped at step 9 of 20."""
     settings = load_settings("fast", "dp3", [word for word in SMALL if word != "--set"])
-    trainer = run.prepare_run(rolls, run, settings, run.ComputeSettings(device="cpu"))
-    assert not run.run(trainer, lambda _: None, stop_after(9))
+    trainer = training_run.prepare_run(rolls, run, settings, training_run.ComputeSettings(device="cpu"))
+    assert not training_run.run(trainer, lambda _: None, stop_after(9))
     return run
 
 

@@ -4,15 +4,17 @@ work."""
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
+from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.pipeline.stage import Rejected, Stage, Writer
+from flowlab.provenance import Provenance
 from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo, Tracks3D
 from flowlab.storage.shard import write_shard
 
@@ -30,7 +32,7 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
         state=demo.state,
         action=demo.action,
         success=demo.success,
-        queries=record.queries,
+        queries=replace(record.queries, pixel=None),
         tracks=tracks,
         object_pose=demo.object_pose,
         depth=seen.depth,
@@ -42,7 +44,7 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
 class ObserverStage(Stage, ObserverSettings):
     """The Observer looks at every frame."""
 
-    stage: Literal["observer"] = "observer"
+    stage: str = "observer"
 
     def process(self, record: Demonstration) -> ObservedDemo:
         """Unproject, crop and sample every frame."""
@@ -67,6 +69,10 @@ class ObserverStage(Stage, ObserverSettings):
                 rgb[t] = frame.rgb
         return ObservedDemo(record, points, count, observer.cloud(first), depth, owner, rgb)
 
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """How the clouds were made, so that a policy's are made the same way."""
+        return provenance.model_copy(update={"observer": _settings(self, ObserverSettings)})
+
 
 def _frame(demo: Demonstration, t: int) -> Frame:
     try:
@@ -78,7 +84,7 @@ def _frame(demo: Demonstration, t: int) -> Frame:
 class QueriesStage(Stage, QuerySettings):
     """Query points are chosen on the first cloud."""
 
-    stage: Literal["queries"] = "queries"
+    stage: str = "queries"
 
     def process(self, record: ObservedDemo) -> QueriedDemo:
         """Choose the points to follow."""
@@ -87,11 +93,20 @@ class QueriesStage(Stage, QuerySettings):
         except DataError as error:
             raise Rejected(str(error)) from error
 
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """How the query points were chosen."""
+        return provenance.model_copy(update={"queries": _settings(self, QuerySettings)})
+
+
+def _settings(stage: Stage, group: type[Settings]) -> dict[str, Any]:
+    """Those settings of a stage that are of a group, as JSON values: neither its name nor what a subclass adds."""
+    return stage.model_dump(mode="json", include=set(group.model_fields))
+
 
 class AcceptStage(Stage):
     """Keeps failed demonstrations out."""
 
-    stage: Literal["accept"] = "accept"
+    stage: str = "accept"
     success_steps: int = Field(default=5, ge=0)
     """Steps the task must have been solved for; 5 is DP3's rule."""
 
@@ -106,7 +121,7 @@ class AcceptStage(Stage):
 class WriteStage(Writer):
     """Writes the episodes of a unit into its shard."""
 
-    stage: Literal["write"] = "write"
+    stage: str = "write"
     depth: bool = False
     """Store the depth pictures too, so that clouds can be cropped anew later."""
     rgb: bool = True

@@ -1,14 +1,13 @@
 """The stages of simulation, with those it shares. Each is a thin skin over the function that does the work."""
 
-from typing import Literal
-
 from flowlab.errors import DataError
 from flowlab.pipeline.memory import return_freed_memory
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.shared import AcceptStage, ObserverStage, QueriesStage, WriteStage, labeled
+from flowlab.provenance import Provenance
 from flowlab.records import Episode, QueriedDemo
 from flowlab.sim.recorder import ExpertSettings, Rollout, TaskSimulator
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.simulation import SceneSettings, describe_scene
 from flowlab.sim.tracks import RigidFlowSettings, label
 
 __all__ = ["AcceptStage", "ExpertStage", "ObserverStage", "QueriesStage", "RigidFlowStage", "WriteStage"]
@@ -17,7 +16,7 @@ __all__ = ["AcceptStage", "ExpertStage", "ObserverStage", "QueriesStage", "Rigid
 class ExpertStage(Stage, ExpertSettings):
     """MetaWorld's scripted expert tries the task."""
 
-    stage: Literal["expert"] = "expert"
+    stage: str = "expert"
     scene: SceneSettings = SceneSettings()
     """What the camera is shown."""
 
@@ -27,6 +26,12 @@ class ExpertStage(Stage, ExpertSettings):
             return self.simulator(record.task).record_expert(record.seed, self)
         except DataError as error:
             raise Rejected(str(error)) from error
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """Simulated by MetaWorld, whose camera and channels are known."""
+        camera = TaskSimulator(task, self.scene).begin(seed=0).camera
+        known = describe_scene(self.scene)
+        return provenance.model_copy(update={**known, "camera": camera.to_json()})
 
     def simulator(self, task: str) -> TaskSimulator:
         """The simulation of a task; the last one used is kept, since units come task by task."""
@@ -44,7 +49,7 @@ _last_simulator: dict[tuple[str, SceneSettings], TaskSimulator] = {}
 class RigidFlowStage(Stage, RigidFlowSettings):
     """Exact tracks: simulated bodies carry their surface points along."""
 
-    stage: Literal["rigid-flow"] = "rigid-flow"
+    stage: str = "rigid-flow"
     of = Rollout
 
     def process(self, record: QueriedDemo) -> Episode:
@@ -53,3 +58,7 @@ class RigidFlowStage(Stage, RigidFlowSettings):
         assert isinstance(demo, Rollout)
         assert seen.owner is not None
         return labeled(record, label(demo, record.queries, seen.depth, seen.owner, self))
+
+    def describe(self, provenance: Provenance, task: str) -> Provenance:
+        """The tracks are exact."""
+        return provenance.model_copy(update={"tracks": "exact"})
