@@ -115,7 +115,7 @@ class Dp3Runner(dp3_steps.Extractor):
         first = self._look()
         seen = deque([first] * s.n_obs_steps, maxlen=s.n_obs_steps)
         queries = np.zeros((0, 3), np.float32)
-        if s.policy == "fdp":
+        if s.needs.flow is not None:
             queries = first[0][farthest_points(first[0], self.network.spec.queries["points"])]
         done, needed = 0, None
         while done < max_steps:

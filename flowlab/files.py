@@ -29,6 +29,24 @@ def remove_leftovers(folder: Path) -> None:
             leftover.unlink(missing_ok=True)
 
 
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that is there whole or not at all.
+
+    Gives an empty folder beside it to fill, which takes its name in the end, or is deleted if anything is raised.
+    What processes that no longer run were making beside it is deleted first.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path.parent)
+    temporary = temporary_path(path)
+    try:
+        temporary.mkdir()
+        yield temporary
+        os.rename(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def _prefix() -> str:
     return f".tmp-{socket.gethostname()}+"  # no machine's name has a plus sign
 

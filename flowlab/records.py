@@ -134,8 +134,9 @@ class Tracks2D(Record):
     """How far a point lands from its start when tracked there and back [px]; -1 where not measured."""
     disagreement: Float32[np.ndarray, "T M"] | None = None
     """How far apart overlapping chunks put the point [px]; -1 where only one chunk covers it."""
-    depth: Float32[np.ndarray, "T M"] | None = None
-    """z-depth [m] where a model of the motion gives it, for points out of sight too; 0 where none does."""
+    xyz_cam: Float32[np.ndarray, "T M 3"] | None = None
+    """Position in the camera frame [m] where a model of the motion gives it, for points out of sight too; (0, 0, 0)
+    where none does."""
     residual: Float32[np.ndarray, "T M"] | None = None
     """How badly that model explains color and depth around the point, 0 to 1; -1 where none does."""
 

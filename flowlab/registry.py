@@ -41,9 +41,23 @@ class Registry(Generic[T]):
         """Entry-point group in which packages offer their own."""
         self._base = base
 
+    def offers(self) -> tuple[Plugin, ...]:
+        """Everything that is installed, one name possibly several times; nothing is imported."""
+        return tuple(Plugin(self.family, e.name, e.value, _package(e)) for e in self._entries())
+
     def plugins(self) -> dict[str, Plugin]:
         """Everything that is installed, by name; nothing is imported."""
-        return {e.name: Plugin(self.family, e.name, e.value, _package(e)) for e in self._entries()}
+        return {plugin.name: plugin for plugin in self.offers()}
+
+    def problem(self, plugin: Plugin) -> str:
+        """Why a plug-in cannot be used, in a sentence; empty where it can. It is imported for that."""
+        try:
+            self.load(plugin.name)
+        except UsageError as error:
+            return str(error)
+        except Exception as error:  # whatever its module does
+            return f"{self.kind} '{plugin.name}' of {plugin.package}: cannot be imported ({first_line(error)})"
+        return ""
 
     def load(self, name: str, folder: Path | None = None) -> type[T]:
         """The class of that name, or at that import path ``module:Class``.
@@ -104,6 +118,14 @@ EXPORTERS: Registry[Any] = Registry("exporters", "exporter", "flowlab.storage.ex
 ENGINES: Registry[Any] = Registry("engines", "engine", "flowlab.engines.base:Engine")
 LOGGERS: Registry[Any] = Registry("loggers", "logger", "flowlab.training.loggers:MetricsLogger")
 REGISTRIES = (TRACKERS, READERS, STAGES, POLICIES, EXPORTERS, ENGINES, LOGGERS)
+
+
+def registry_of(family: str) -> Registry[Any]:
+    """The registry of a family, such as ``trackers``. Raises :class:`UsageError` with the names of all."""
+    known = {registry.family: registry for registry in REGISTRIES}
+    if family not in known:
+        raise unknown_name("family of plug-ins", family, known)
+    return known[family]
 
 
 def _is_a(cls: type, base: type) -> bool:

@@ -8,13 +8,16 @@ import numpy as np
 import torch
 from synthetic import make_episode
 
-from flowlab.data.batches import Batch, BatchBuilder, WindowIndex, index_windows
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.normalizer import Normalizer, Scale
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
+from flowlab.data.settings import TrainSettings
+from flowlab.data.window_sampler import WindowIndex, index_windows
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicySpec
-from flowlab.policies.settings import TrainSettings, load_settings
+from flowlab.policies.settings import load_settings
 from flowlab.records import Episode, Role
 
 MLP = "{kind: mlp, widths: [16, 16], step_embedding: 8}"
@@ -30,10 +33,6 @@ _SMALL = (
     "encoder.features=8",
     "encoder.state_widths=[8, 8]",
     f"action={MLP}",
-    "motion.points=6",
-    "motion.subset=null",
-    "motion.features=8",
-    f"motion.denoiser={MLP}",
     "diffusion.train_steps=20",
     "diffusion.inference_steps=5",
     "batch.windows=8",
@@ -42,20 +41,23 @@ _SMALL = (
     "batch.shift_m=0",
     "batch.turn_deg=0",
 )
+_SMALL_MOTION = ("motion.features=8", f"motion.denoiser={MLP}")
+_SMALL_FLOW = ("motion.points=6", "motion.subset=null")
 NORMALIZER = Normalizer(
-    place=Scale(offset=(0.1, -0.2, 0.3), unit=(0.5, 0.5, 0.5)),
+    position=Scale(offset=(0.1, -0.2, 0.3), unit=(0.5, 0.5, 0.5)),
     state=Scale(offset=tuple(np.linspace(-0.3, 0.3, 9).tolist()), unit=tuple(np.linspace(0.5, 2, 9).tolist())),
     action=Scale(offset=(0.3, -0.1, 0.2, 0.5), unit=(2.0, 1.5, 1.0, 0.5)),
     flow=Scale(offset=(0, 0, 0), unit=(0.02, 0.02, 0.02)),
     flow_clip=3.0,
 )
 HAND = ChannelSpec(gripper=(0, 1, 2), state_positions=((0, 1, 2), (3, 4, 5)), action_position=(0, 1, 2))
-"""Of a state that begins with two places, the gripper's and another, and of an action that begins with one."""
+"""Of a state that begins with two positions, the gripper's and another, and of an action that begins with one."""
 
 
-def tiny_settings(policy: str, *overrides: str, profile: str = "fast") -> TrainSettings:
+def tiny_settings(policy: str, *overrides: str, profile: str = "fast") -> Any:
     """The settings of a profile with everything small."""
-    return load_settings(profile, policy, [*_SMALL, *overrides])
+    motion = {"dp3": (), "mba": _SMALL_MOTION, "fdp": _SMALL_MOTION + _SMALL_FLOW}[policy]
+    return load_settings(profile, policy, [*_SMALL, *motion, *overrides])
 
 
 def tiny_spec(settings: TrainSettings, **changes: Any) -> PolicySpec:
@@ -85,11 +87,11 @@ def random_buffer(
     role = rng.choice([Role.OBJECT, Role.ROBOT, Role.PROP, -1], (len(demos), queries))
     role[:, 0] = Role.OBJECT
     return ReplayBuffer(
-        demos=tuple(
+        episodes=tuple(
             EpisodeSlice(task, seed, start, stop)
             for seed, ((task, _), start, stop) in enumerate(zip(demos, starts, ends, strict=True))
         ),
-        points=rng.normal(0, 0.3, (frames, points, 3)).astype(np.float32),
+        point_cloud=rng.normal(0, 0.3, (frames, points, 3)).astype(np.float32),
         state=rng.normal(0, 0.3, (frames, 9)).astype(np.float32),
         action=rng.uniform(-1, 1, (frames, 4)).astype(np.float32),
         tracks=tracks.astype(np.float32),
@@ -123,16 +125,16 @@ def recorded(seed: int, *, away: float = 0.0, action: Callable[[np.ndarray], np.
 
 def every_window(buffer: ReplayBuffer, settings: TrainSettings) -> WindowIndex:
     """All windows of all demonstrations, as one run."""
-    return index_windows(buffer, list(range(len(buffer.demos))), settings.n_action_steps)
+    return index_windows(buffer, list(range(len(buffer.episodes))), settings.n_action_steps)
 
 
-def random_batch(settings: TrainSettings, layout: ChannelSpec | None = None) -> Batch:
+def random_batch(settings: TrainSettings, channels: ChannelSpec | None = None) -> Batch:
     """All windows of :func:`random_buffer`."""
     buffer = random_buffer()
-    return BatchBuilder(buffer, layout or ChannelSpec(), settings, buffer.tasks).build(every_window(buffer, settings))
+    return BatchBuilder(buffer, channels or ChannelSpec(), settings, buffer.tasks).build(every_window(buffer, settings))
 
 
-def draws(seed: int = 0, part: slice | None = None) -> NoiseSampler:
+def sampler(seed: int = 0, part: slice | None = None) -> NoiseSampler:
     return NoiseSampler(torch.Generator().manual_seed(seed), part=part)
 
 

@@ -15,25 +15,11 @@ from safetensors.numpy import load_file
 from synthetic import call_cli, make_dataset, make_episode, with_quality
 
 from flowlab.cli import main
+from flowlab.policies.settings import load_settings
 from flowlab.records import Episode, Queries
 
-NETWORK = (
-    "encoder.points=64",
-    "encoder.subset=null",
-    "encoder.widths=[16,16]",
-    "encoder.features=16",
-    "encoder.state_widths=[16,16]",
-    "action.widths=[32]",
-    "action.step_embedding=16",
-    "motion.points=8",
-    "motion.features=16",
-    "motion.denoiser.widths=[16]",
-    "motion.denoiser.step_embedding=16",
-    "batch.windows=16",
-    "batch.segment=4",
-    "batch.draws=2",
-)
-"""Everything but how long a run takes."""
+NETWORK = Path(__file__).parent / "profiles/network.yaml"
+"""A profile with small networks; it says nothing of how long a run takes."""
 
 
 def options(*changes: str) -> list[str]:
@@ -41,8 +27,14 @@ def options(*changes: str) -> list[str]:
     return [word for change in changes for word in ("--set", change)]
 
 
-SMALL = (*options(*NETWORK, "run.minutes=null", "run.steps=20", "run.validations=4"),)
-"""A run of 20 steps, with a checkpoint after every fourth and a look at held-out demonstrations after every fifth."""
+SMALL = ("--profile", str(Path(__file__).parent / "profiles/small.yaml"))
+"""The same, and a run of 20 steps, with a checkpoint after every fourth and a look at held-out demonstrations after
+every fifth."""
+
+
+def small_settings(policy: str, *changes: str) -> Any:
+    """The settings of such a run."""
+    return load_settings(SMALL[1], policy, changes)
 
 
 def make_rolls(folder: Path, episodes: int = 4, **changes: Any) -> Path:
@@ -76,7 +68,7 @@ def without_times(lines: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{k: v for k, v in line.items() if k not in ("cpu_s", "wall_s", "samples_per_s")} for line in lines]
 
 
-def kept_by(run: Path) -> dict[str, bytes]:
+def saved_by(run: Path) -> dict[str, bytes]:
     """The bytes of all weights of a run, and of what resuming needs."""
     return {str(f.relative_to(run)): f.read_bytes() for f in sorted(run.rglob("*.safetensors"))}
 

@@ -77,16 +77,18 @@ def validate(dataset: Path, as_json: bool) -> None:
 
 @click.command()
 @click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--to", "layout", type=click.Choice(["dp3"]), required=True, help="The other tool.")
+@click.option("--to", "exporter", required=True, metavar="NAME", help="Which tool: dp3, or one of a plug-in.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Where to write.")
 @click.option("--task", help="Only this task's episodes.")
-def export(dataset: Path, layout: str, out: Path, task: str | None) -> None:
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change an option of the exporter.")
+def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...]) -> None:
     """Write a dataset in another tool's layout.
 
-    dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads.
+    dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads. 'flowlab plugins exporters' lists what
+    is installed.
     """
     from flowlab.storage.dataset import Dataset
-    from flowlab.storage.exporters.dp3 import export_dp3
+    from flowlab.storage.exporters.base import make_exporter
 
-    count = export_dp3(Dataset(dataset), out, task)
-    click.echo(f"{count} episodes written to {out} for {layout}")
+    count = make_exporter(exporter, settings).export(Dataset(dataset), out, task)
+    click.echo(f"{count} episodes written to {out} for {exporter}")

@@ -4,13 +4,13 @@ from collections.abc import Iterator
 from typing import Any
 
 from flowlab.errors import DataError
-from flowlab.recordings.recording import Description, StreamInfo
+from flowlab.recordings.recording import RecordingDescription, StreamInfo
 
 _SHOWN = 5
 """Bad frames that people are shown of one recording; JSON has all."""
 
 
-def facts_of(found: Description | DataError) -> dict[str, Any]:
+def facts_of(found: RecordingDescription | DataError) -> dict[str, Any]:
     """What was recognized of a recording, or only its problem."""
     if isinstance(found, DataError):
         return {"problem": str(found)}

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 @click.option("--chunk", type=click.IntRange(min=1), help="Frames to a chunk [the recipe's: 33].")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next [the recipe's: 8].")
 @click.option("--weights", type=click.Path(path_type=Path), help="File with a learned tracker's weights.")
+@click.option("--reader", help="Short for --set recording.reader=NAME [the one that recognizes the recording].")
 @click.option("--calibration", type=click.Path(path_type=Path), help="YAML file with calibration for all of them.")
 @click.option("--recipe", default="real", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
@@ -43,6 +44,7 @@ def track_real(
     chunk: int | None,
     stride: int | None,
     weights: Path | None,
+    reader: str | None,
     calibration: Path | None,
     recipe: str,
     overrides: tuple[str, ...],
@@ -70,6 +72,7 @@ def track_real(
         "track.chunks.length": chunk,
         "track.chunks.stride": stride,
         "track.options.weights": weights,
+        "recording.reader": reader,
         "recording.calibration": calibration,
     }
     changes = [f"{key}={json.dumps(str(v) if isinstance(v, Path) else v)}" for key, v in short.items() if v is not None]

@@ -1,28 +1,40 @@
 """``flowlab train``."""
 
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import TrainingBar, console, print_json, print_table
+from flowlab.cli.console import STEPS_LINE, ProgressBar, console, print_json, print_table, show_training
 from flowlab.errors import UsageError
+from flowlab.registry import LOGGERS, POLICIES, Registry
 
 if TYPE_CHECKING:
-    from flowlab.training.trainer import Trainer
+    from flowlab.training.run import Precision
+    from flowlab.training.train import TrainedRun
+
+
+class PluginOption(click.Option):
+    """An option whose value is a name of a registry: its help lists those that are installed."""
+
+    def __init__(self, *declarations: Any, registry: Registry[Any], **attributes: Any) -> None:
+        super().__init__(*declarations, **attributes)
+        self._registry = registry
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """The option as ``--help`` shows it."""
+        record = super().get_help_record(ctx)
+        names = ", ".join(self._registry.plugins())
+        return record and (record[0], f"{record[1]} There are: {names}; or module:Class.")
 
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option(
-    "--policy", help="fdp (3D Flow Diffusion Policy), dp3 (3D Diffusion Policy) or mba (Motion Before Action)."
-)
+@click.option("--policy", cls=PluginOption, registry=POLICIES, help="What to train.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the run.")
-@click.option("--profile", help="fast, paper, or a YAML file with all settings  [fast].")
+@click.option("--profile", help="fast, paper, or a YAML file with the settings that differ  [fast].")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Train as long as this; see --help's end.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: motion.points=50.")
 @click.option("--seed", type=click.IntRange(min=0), help="Short for --set run.seed=...")
@@ -32,7 +44,9 @@ if TYPE_CHECKING:
 @click.option("--device", help="cpu, cuda or cuda:1  [a GPU if there is one].")
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads of each process  [1].")
 @click.option("--precision", type=click.Choice(["fp32", "bf16"]), help="[bf16 where the device has units for it].")
-@click.option("--log", "logs", multiple=True, metavar="NAME", help="Also log to tensorboard or wandb.")
+@click.option(
+    "--log", "logs", cls=PluginOption, registry=LOGGERS, multiple=True, metavar="NAME", help="Also log there."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def train(
     source: Path,
@@ -47,7 +61,7 @@ def train(
     resume: bool,
     device: str | None,
     threads: int | None,
-    precision: str | None,
+    precision: "Precision | None",
     logs: tuple[str, ...],
     as_json: bool,
 ) -> None:
@@ -73,88 +87,55 @@ def train(
             raise UsageError(f"--resume goes on as the run began, so leave out {', '.join(changed)}")
     elif policy is None or out is None:
         raise UsageError(
-            f"say what to train and where to keep it, as in 'flowlab train {source} --policy fdp --out runs/fdp'; "
+            f"say what to train and where to save it, as in 'flowlab train {source} --policy fdp --out runs/fdp'; "
             "--resume goes on with a run"
         )
-    from flowlab.policies.settings import load_settings
-    from flowlab.training import run
+    from flowlab.training import train as training
+    from flowlab.training.distributed import is_first_process
 
-    asked_for = {"device": device, "threads": threads, "precision": precision, "logs": logs or None}
-    machine = {name: value for name, value in asked_for.items() if value is not None}
-    if resume:
-        trainer = run.resume_run(source, **machine)
-    else:
-        assert policy is not None
-        assert out is not None
-        changes = [f"run.minutes={minutes}", "run.steps=null"] if minutes else []
-        changes += [f"run.seed={seed}"] if seed is not None else []
-        settings = load_settings(profile or "fast", policy, [*overrides, *changes])
-        trainer = run.prepare_run(
-            source, out, settings, run.ComputeSettings(**machine), overfit=overfit, began_from=began_from
-        )
-    first = trainer.processes.is_first
-    if first and not as_json:
-        _describe(trainer)
-    with TrainingBar(quiet=as_json or not first) as bar, _stop_on_signal() as asked:
-        finished = run.run(trainer, bar.update, lambda: bool(asked))
+    first = is_first_process()
+    quiet = as_json or not first
+    with ProgressBar(quiet, STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
+        watch = training.Watch(_silent if quiet else _say, partial(show_training, bar), should_stop)
+        if resume:
+            done = training.resume(
+                source, device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
+            )
+        else:
+            assert policy is not None
+            assert out is not None
+            done = training.train(
+                source, out, policy=policy, profile=profile or "fast", minutes=minutes, settings=overrides, seed=seed,
+                overfit=overfit, began_from=began_from, device=device or "auto", threads=threads or 1,
+                precision=precision or "auto", logs=logs, watch=watch,
+            )  # fmt: skip
     if first:
-        _finish(trainer, finished, as_json)
-    if not finished:
+        _print(done, as_json)
+    if not done.finished:
         sys.exit(130)
 
 
-def _describe(trainer: "Trainer") -> None:
-    """Say what was found and what will be done, before it takes long."""
-    spec, run = trainer.policy.spec, trainer.run
-    millions = sum(p.numel() for p in trainer.policy.parameters()) / 1e6
-    console.print(
-        f"{spec.settings.policy}, {millions:.1f} M weights, {run.steps - trainer.step:,} steps on "
-        f"{len(run.train)} demonstrations of {', '.join(spec.tasks)}; {len(run.held_out)} held out; "
-        f"{trainer.processes.description}",
-        highlight=False,
-        soft_wrap=True,
-    )
-    if spec.settings.encoder.relative and spec.channels.gripper is None:
-        console.print(
-            "points are given in the world frame: the data do not tell where in it the gripper is",
-            highlight=False,
-            soft_wrap=True,
-        )
+def _silent(text: str) -> None:
+    """Not in JSON, nor in other processes than the first."""
 
 
-def _finish(trainer: "Trainer", finished: bool, as_json: bool) -> None:
-    """Draw the curve, and print what came out."""
-    from flowlab.policies.checkpoint import writing_run
-    from flowlab.training.metrics import METRICS, last_metrics
-    from flowlab.viz.curve_figure import draw_curve
+def _say(text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True)
 
-    folder = trainer.folder
-    metrics = folder / METRICS
-    report: dict[str, Any] = {
-        "run": str(folder),
-        "policy": trainer.settings.policy,
-        "step": trainer.step,
-        "steps": trainer.run.steps,
-        "finished": finished,
-        "training": last_metrics(metrics, "train"),
-        "validation": last_metrics(metrics, "validation"),
-    }
-    if report["training"] or report["validation"]:
-        with writing_run(folder):
-            draw_curve(metrics, folder / "curve.png")
+
+def _print(done: "TrainedRun", as_json: bool) -> None:
+    """What came out."""
     if as_json:
-        print_json(report)
+        print_json(done.to_json())
         return
-    if report["validation"]:
+    if done.validation:
         print_table(
-            ["on held-out demonstrations", "policy", "doing nothing", "going on as before"], _rows(report["validation"])
+            ["on held-out demonstrations", "policy", "doing nothing", "going on as before"], _rows(done.validation)
         )
-    if not finished:
-        click.echo(
-            f"stopped at step {trainer.step} of {trainer.run.steps}; go on with: flowlab train {folder} --resume"
-        )
+    if done.finished:
+        click.echo(f"{done.folder}: trained for {done.step} steps; the curve is {done.curve}")
     else:
-        click.echo(f"{folder}: trained for {trainer.step} steps; the curve is {folder / 'curve.png'}")
+        click.echo(f"stopped at step {done.step} of {done.steps}; go on with: flowlab train {done.folder} --resume")
 
 
 def _rows(errors: dict[str, float]) -> list[list[object]]:
@@ -164,21 +145,3 @@ def _rows(errors: dict[str, float]) -> list[list[object]]:
         [name, errors[name], errors[f"{name}_zero"], errors.get(f"{name}_hold", errors.get(f"{name}_constant", ""))]
         for name in names
     ]
-
-
-@contextmanager
-def _stop_on_signal() -> Iterator[list[int]]:
-    """A list that holds a signal once one asked to stop; a second one stops at once."""
-    asked: list[int] = []
-
-    def ask(number: int, _: object) -> None:
-        if asked:
-            raise KeyboardInterrupt
-        asked.append(number)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""Demonstrations moved about in the world: the same scene, elsewhere on the table."""
+"""Scenes moved about in the world: the same demonstration, elsewhere on the table."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ class SceneAugmentation:
     def transform_points(
         self, xyz: Float32[np.ndarray, "n *s 3"], run: Int[np.ndarray, "n"]
     ) -> Float32[np.ndarray, "n *s 3"]:
-        """Where points of given runs get to [m]."""
+        """Where points of given runs [m], world frame, get to."""
         shift = self.shift[run].reshape(len(run), *[1] * (xyz.ndim - 2), 3)
         return self.rotate_vectors(xyz - self.center, run) + self.center + shift
 

@@ -1,27 +1,31 @@
-"""Which numbers of state and action are places in the world, so that scenes can be moved and given relatively."""
+"""Which numbers of state and action are positions in the world, so that scenes can be moved and given relatively."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from flowlab.config import Settings
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
+from flowlab.provenance import Channels
 
 _NEAR_M = 0.1
 """The gripper is taken to be where the state says if, in the median, a point of the cloud is this near."""
 _REACHED_M = 0.02
-"""Actions are taken to be places if, in the median, the gripper is this near to them a step later."""
+"""Actions are taken to be positions if, in the median, the gripper is this near to them a step later."""
+Triple = tuple[int, int, int]
 
 
 class ChannelSpec(Settings):
-    """Triples of channels that are places in the world frame [m]."""
+    """Triples of channels that are positions in the world frame [m]."""
 
-    gripper: tuple[int, int, int] | None = None
+    gripper: Triple | None = None
     """Of the state: where the gripper is; None where that is not known."""
-    state_positions: tuple[tuple[int, int, int], ...] = ()
-    """Of the state: every place, the gripper's too."""
-    action_position: tuple[int, int, int] | None = None
+    state_positions: tuple[Triple, ...] = ()
+    """Of the state: every position, the gripper's too."""
+    action_position: Triple | None = None
     """Of the action: where the gripper is sent to; None where actions are displacements or not known."""
-    action_displacement: tuple[int, int, int] | None = None
+    action_displacement: Triple | None = None
     """Of the action: how far the gripper is to move along the world's axes; None where that is not known."""
 
     def turns(self, state_width: int, action_width: int) -> bool:
@@ -34,31 +38,51 @@ class ChannelSpec(Settings):
 
 
 def infer_channels(source: TrainingSource, buffer: ReplayBuffer) -> ChannelSpec:
-    """The layout of a dataset: known for simulation, measured for recordings, unknown in DP3's frame.
+    """The channels of a dataset: as its provenance says; where a recording's says nothing, as its numbers show.
 
-    DP3 gives clouds in its camera's frame and the state in the world's.
+    What is neither said nor a recording's, or is said to be in another frame than the clouds, is not known.
     """
-    first = (0, 1, 2)
-    if "expert" in source.settings:
-        if source.settings["expert"]["scene"]["convention"] == "dp3":
-            return ChannelSpec()
-        fingers = (3, 4, 5), (6, 7, 8)
-        return ChannelSpec(gripper=first, state_positions=(first, *fingers), action_displacement=first)
-    if not source.settings or buffer.state.shape[1] < 3 or not _gripper_is_seen(buffer):
+    about = source.provenance
+    if about.state is not None or about.action is not None:
+        return _as_stated(about.state or (), about.action or ())
+    if about.kind != "recorded" or buffer.state.shape[1] < 3 or not _gripper_is_seen(buffer):
         return ChannelSpec()
-    places = buffer.action.shape[1] >= 3 and _actions_are_places(buffer)
-    return ChannelSpec(gripper=first, state_positions=(first,), action_position=first if places else None)
+    first = (0, 1, 2)
+    to_positions = buffer.action.shape[1] >= 3 and _actions_are_positions(buffer)
+    return ChannelSpec(gripper=first, state_positions=(first,), action_position=first if to_positions else None)
+
+
+def _as_stated(state: Sequence[Channels], action: Sequence[Channels]) -> ChannelSpec:
+    """The gripper is the first position of a state."""
+    positions = _triples(state, "position", ("m",))
+    return ChannelSpec(
+        gripper=positions[0] if positions else None,
+        state_positions=tuple(positions),
+        action_position=next(iter(_triples(action, "position", ("m",))), None),
+        # A displacement is only turned, so that its unit does not matter.
+        action_displacement=next(iter(_triples(action, "displacement", None)), None),
+    )
+
+
+def _triples(channels: Sequence[Channels], kind: str, units: tuple[str, ...] | None) -> list[Triple]:
+    """The triples of a kind along the axes of the world frame, in order of their first channel."""
+    found = [
+        (c.index[0], c.index[1], c.index[2])
+        for c in channels
+        if c.kind == kind and c.frame == "world" and len(c.index) == 3 and (units is None or c.unit in units)
+    ]
+    return sorted(found)
 
 
 def _gripper_is_seen(buffer: ReplayBuffer) -> bool:
     rows = np.linspace(0, len(buffer.state) - 1, min(len(buffer.state), 200)).astype(int)
-    nearest = [np.linalg.norm(buffer.points[r] - buffer.state[r, :3], axis=1).min() for r in rows]
+    nearest = [np.linalg.norm(buffer.point_cloud[r] - buffer.state[r, :3], axis=1).min() for r in rows]
     return bool(np.median(nearest) < _NEAR_M)
 
 
-def _actions_are_places(buffer: ReplayBuffer) -> bool:
+def _actions_are_positions(buffer: ReplayBuffer) -> bool:
     apart = [
-        np.linalg.norm(buffer.action[d.start : d.stop - 1, :3] - buffer.state[d.start + 1 : d.stop, :3], axis=1)
-        for d in buffer.demos
+        np.linalg.norm(buffer.action[e.start : e.stop - 1, :3] - buffer.state[e.start + 1 : e.stop, :3], axis=1)
+        for e in buffer.episodes
     ]
     return bool(np.median(np.concatenate(apart)) < _REACHED_M)

@@ -9,12 +9,13 @@ from torch import Tensor, nn
 
 from flowlab.config import Settings
 from flowlab.data.channels import ChannelSpec
+from flowlab.data.needs import FlowNeeds
 from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource
-from flowlab.policies.settings import TrainSettings
 
 _STILL = 1e-4
-"""A channel that varies less than this is only centerd, as in DP3."""
+"""A channel that varies less than this is only centered, as in DP3."""
 
 
 class Scale(Settings):
@@ -34,13 +35,13 @@ class Scale(Settings):
 class Normalizer(Settings):
     """The scales of a dataset. Lengths have one unit for all axes, so that shapes keep their proportions."""
 
-    place: Scale
+    position: Scale
     """Points, and positions of the object; relative to the gripper where the policy is."""
     state: Scale
     action: Scale
-    flow: Scale
-    """Zero is no motion."""
-    flow_clip: float
+    flow: Scale | None = None
+    """Zero is no motion; None where the policy learns no flow."""
+    flow_clip: float | None = None
     """Normalized flow is clipped here."""
 
 
@@ -51,26 +52,24 @@ def fit_normalizer(
     arrays = source.statistics["arrays"]
     low, high = np.array(arrays["point_cloud"]["min"]), np.array(arrays["point_cloud"]["max"])
     center, half = (low + high) / 2, float((high - low).max() / 2)
-    relative = settings.encoder.relative and channels.gripper is not None
+    relative = settings.relative_to_gripper and channels.gripper is not None
     action = arrays["action"]["min"], arrays["action"]["max"]
     if relative and channels.action_position is not None:
         action = _relative_limits(buffer, channels, settings)
     scale = Scale.of_limits(*action)
     if settings.batch.turn_deg and channels.action_displacement is not None:
-        scale = _alike_in_all_directions(scale, action, channels.action_displacement)
-    flow_unit, flow_clip = _flow_scale(source.statistics, settings)
+        scale = _isotropic(scale, action, channels.action_displacement)
+    flow, flow_clip = _flow_scale(source.statistics, settings.needs.flow)
     return Normalizer(
-        place=Scale(offset=(0.0,) * 3 if relative else tuple(center.tolist()), unit=(half,) * 3),
+        position=Scale(offset=(0.0,) * 3 if relative else tuple(center.tolist()), unit=(half,) * 3),
         state=Scale.of_limits(arrays["state"]["min"], arrays["state"]["max"]),
         action=scale,
-        flow=Scale(offset=(0.0,) * 3, unit=(flow_unit,) * 3),
+        flow=flow,
         flow_clip=flow_clip,
     )
 
 
-def _alike_in_all_directions(
-    scale: Scale, limits: tuple[Sequence[float], Sequence[float]], channels: tuple[int, int, int]
-) -> Scale:
+def _isotropic(scale: Scale, limits: tuple[Sequence[float], Sequence[float]], channels: tuple[int, int, int]) -> Scale:
     """A scale whose ``channels`` have one unit and no offset, so that a turned displacement is in range, too."""
     offset, unit = np.array(scale.offset), np.array(scale.unit)
     offset[list(channels)] = 0
@@ -78,33 +77,33 @@ def _alike_in_all_directions(
     return Scale(offset=tuple(offset.tolist()), unit=tuple(unit.tolist()))
 
 
-def _flow_scale(statistics: Mapping[str, Any], settings: TrainSettings) -> tuple[float, float]:
-    """The unit of flow [m], and the greatest normalized value."""
-    flow = statistics["arrays"].get("flow")
-    if flow is None:
-        return 1.0, 1.0
-    largest = max(*map(abs, flow["min"]), *map(abs, flow["max"]), _STILL)
-    if settings.motion.scale == "limits":
-        return largest, 1.0
-    return max(min(statistics["motion"]["step_m"]["p99"], largest), _STILL), settings.motion.clip
+def _flow_scale(statistics: Mapping[str, Any], needs: FlowNeeds | None) -> tuple[Scale | None, float | None]:
+    """The scale of flow [m], and the greatest normalized value."""
+    if needs is None:
+        return None, None
+    flow = statistics["arrays"]["flow"]
+    unit, clip = max(*map(abs, flow["min"]), *map(abs, flow["max"]), _STILL), 1.0
+    if needs.scale == "quantile":
+        unit, clip = max(min(statistics["motion"]["step_m"]["p99"], unit), _STILL), needs.clip
+    return Scale(offset=(0.0,) * 3, unit=(unit,) * 3), clip
 
 
 def _relative_limits(
     buffer: ReplayBuffer, channels: ChannelSpec, settings: TrainSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of the actions of a window, where places are given relative to the gripper when it is decided on."""
+    """Limits of the actions of a window, where positions are given relative to the gripper when it is decided on."""
     assert channels.gripper is not None
     assert channels.action_position is not None
-    gripper, place = list(channels.gripper), list(channels.action_position)
+    gripper, target = list(channels.gripper), list(channels.action_position)
     low, high = np.array(buffer.action).min(0), np.array(buffer.action).max(0)
-    low[place], high[place] = np.inf, -np.inf
-    for demo in buffer.demos:
-        action, state = buffer.action[demo.start : demo.stop], buffer.state[demo.start : demo.stop]
+    low[target], high[target] = np.inf, -np.inf
+    for e in buffer.episodes:
+        action, state = buffer.action[e.start : e.stop], buffer.state[e.start : e.stop]
         for ahead in range(1 - settings.n_obs_steps, settings.horizon - settings.n_obs_steps + 1):
-            then = np.clip(np.arange(len(demo)) + ahead, 0, len(demo) - 1)
-            away = action[then][:, place] - state[:, gripper]
-            low[place] = np.minimum(low[place], away.min(0))
-            high[place] = np.maximum(high[place], away.max(0))
+            then = np.clip(np.arange(len(e)) + ahead, 0, len(e) - 1)
+            away = action[then][:, target] - state[:, gripper]
+            low[target] = np.minimum(low[target], away.min(0))
+            high[target] = np.maximum(high[target], away.max(0))
     return low, high
 
 

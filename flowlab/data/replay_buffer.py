@@ -1,27 +1,24 @@
 """The demonstrations as training reads them: decoded once, then mapped into memory."""
 
-import os
-import shutil
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, UInt8
 
+from flowlab.data.cache import cached_part, open_part
 from flowlab.data.source import TrainingSource
-from flowlab.errors import DataError
-from flowlab.files import locked, read_json, remove_leftovers, temporary_path, write_json
 from flowlab.records import Episode
 
-_DONE = "corpus.json"
-"""Written last: a folder that has it is whole."""
-_FORMAT = 1
+ARRAYS = "arrays"
+"""Name of the cached part of a dataset that holds everything but pictures."""
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeSlice:
-    """Where a demonstration lies in the arrays of a corpus."""
+    """Where a demonstration lies in the arrays of a :class:`ReplayBuffer`."""
 
     task: str
     seed: int
@@ -35,11 +32,11 @@ class EpisodeSlice:
 
 @dataclass(frozen=True, slots=True)
 class ReplayBuffer:
-    """All demonstrations of a dataset, one behind the other: F frames, D demonstrations, Q query points."""
+    """All demonstrations of a dataset, one behind the other: F frames, E episodes, Q query points."""
 
-    demos: tuple[EpisodeSlice, ...]
+    episodes: tuple[EpisodeSlice, ...]
     """In order of task and seed."""
-    points: Float32[np.ndarray, "F N 3"]
+    point_cloud: Float32[np.ndarray, "F N 3"]
     """World frame [m]."""
     state: Float32[np.ndarray, "F S"]
     action: Float32[np.ndarray, "F A"]
@@ -50,125 +47,81 @@ class ReplayBuffer:
     """Stated error [m]; 0 for exact tracks."""
     object_pose: Float32[np.ndarray, "F P"]
     """P is 9, or 0 where it is not known."""
-    queries: Float32[np.ndarray, "D Q 3"]
-    query_role: Int[np.ndarray, "D Q"]
-    query_count: Int[np.ndarray, "D 1"]
+    queries: Float32[np.ndarray, "E Q 3"]
+    query_role: Int[np.ndarray, "E Q"]
+    query_count: Int[np.ndarray, "E 1"]
+    rgb: UInt8[np.ndarray, "F H W 3"] | None = None
+    """Color pictures; None where they were not asked for, or the dataset has none."""
+    depth: Float32[np.ndarray, "F H W"] | None = None
+    """z-depth [m], 0 where there is no reading; None as above."""
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """Names of the tasks, sorted."""
-        return tuple(sorted({d.task for d in self.demos}))
+        return tuple(sorted({e.task for e in self.episodes}))
 
     def split(self, demonstrations: int | None, held_out: int) -> tuple[list[int], list[int]]:
-        """Which demonstrations to train on, and which to validate on; see :class:`DataSettings`."""
+        """Which episodes to train on, and which to validate on; see
+        :class:`~flowlab.data.settings.DataSettings`."""
         train, held = [], []
         for task in self.tasks:
-            of_task = [k for k, d in enumerate(self.demos) if d.task == task]
+            of_task = [k for k, e in enumerate(self.episodes) if e.task == task]
             last = len(of_task) - min(held_out, len(of_task) // 3)
             train += of_task[:last][:demonstrations]
             held += of_task[last:]
         return train, held
 
 
-def load_buffer(source: TrainingSource, fallback: Path) -> ReplayBuffer:
-    """The corpus of a source, decoded into ``cache`` below it, or into ``fallback`` where that cannot be written.
+def load_buffer(source: TrainingSource, fallback: Path, pictures: Sequence[str] = ()) -> ReplayBuffer:
+    """The demonstrations of a source, decoded into ``cache`` below it.
 
     Decoded once for each content of the dataset; later calls only map the files.
+
+    Args:
+        source: The dataset or store.
+        fallback: Folder that takes the cache where the dataset's own cannot be written.
+        pictures: Which of ``rgb`` and ``depth`` are wanted; they are large, and decoded only on demand.
+
+    Raises:
+        DataError: Neither folder can be written, or the episodes are of different widths.
     """
-    name = f"{source.fingerprint}-{_FORMAT}"
-    places = [source.path / "cache" / name, fallback / "cache" / name]
-    for place in places:
-        if (place / _DONE).exists():
-            return _open(place)
-    folder = next((p for p in places if _writable(p.parent)), None)
-    if folder is None:
-        raise DataError(f"{fallback}: cannot be written; choose another --out")
-    with locked(folder.parent):
-        if not (folder / _DONE).exists():
-            remove_leftovers(folder.parent)
-            temporary = temporary_path(folder)
-            try:
-                _decode(source, temporary)
-                for outdated in folder.parent.glob("*"):
-                    if outdated != temporary:
-                        shutil.rmtree(outdated, ignore_errors=True)
-                os.replace(temporary, folder)
-            except OSError as error:
-                raise DataError(f"{folder}: cannot be written ({error.strerror}); make room there") from error
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
-    return _open(folder)
+    episodes, arrays = open_part(cached_part(source, fallback, ARRAYS, arrays_of))
+    slices = tuple(EpisodeSlice(**e) for e in episodes)
+    known = {name: array for name, array in arrays.items() if name in ReplayBuffer.__dataclass_fields__}
+    return ReplayBuffer(slices, **known, **load_pictures(source, fallback, pictures))
 
 
-def _writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
+def load_pictures(source: TrainingSource, fallback: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Those of the pictures (F, H, W, ...) that the dataset has; each kind has a cache of its own."""
+    found: dict[str, np.ndarray] = {}
+    for name in names:
+        found |= open_part(cached_part(source, fallback, name, partial(pictures_of, name=name)))[1]
+    return found
 
 
-def _open(folder: Path) -> ReplayBuffer:
-    values = read_json(folder / _DONE)
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in values["arrays"]}
-    return ReplayBuffer(demos=tuple(EpisodeSlice(**d) for d in values["demos"]), **arrays)
-
-
-def _decode(source: TrainingSource, folder: Path) -> None:
-    """Write every array of the corpus, episode by episode."""
-    folder.mkdir()
-    arrays: dict[str, np.ndarray] = {}
-    demos: list[EpisodeSlice] = []
-    queries: list[dict[str, np.ndarray]] = []
-    row = 0
-    for episode in source.episodes():
-        demo = EpisodeSlice(episode.task, episode.seed, row, row + len(episode))
-        for name, values in _per_frame(episode).items():
-            if name not in arrays:
-                arrays[name] = _create(folder / f"{name}.npy", values.dtype, (source.frames, *values.shape[1:]))
-            if values.shape[1:] != arrays[name].shape[1:]:
-                raise DataError(
-                    f"{source.path}: {demo.task} seed {demo.seed}: '{name}' is {values.shape[1:]} wide, in those "
-                    f"before {arrays[name].shape[1:]}; train on one of them at a time"
-                )
-            arrays[name][demo.start : demo.stop] = values
-        demos.append(demo)
-        queries.append(_per_demo(episode))
-        row = demo.stop
-    order = sorted(range(len(demos)), key=lambda k: (demos[k].task, demos[k].seed))
-    for name in queries[0]:
-        np.save(folder / f"{name}.npy", np.stack([queries[k][name] for k in order]))
-    for array in arrays.values():
-        array.flush()  # type: ignore[attr-defined]
-    names = [*arrays, *queries[0]]
-    write_json(folder / _DONE, {"demos": [asdict(demos[k]) for k in order], "arrays": names})
-
-
-def _create(path: Path, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """A mapped array whose space on disk is taken: without that a full disk kills the process as it writes."""
-    array = np.lib.format.open_memmap(path, "w+", dtype, shape)
-    with path.open("r+b") as file:
-        os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
-    return array
-
-
-def _per_frame(e: Episode) -> Mapping[str, np.ndarray]:
+def arrays_of(e: Episode) -> tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]:
+    """What is cached of an episode but for pictures: arrays with a row per frame, and arrays of the whole episode."""
     tracks = e.tracks
     exact = np.zeros(tracks.visible.shape, np.float32)
     return {
-        "points": e.point_cloud,
+        "point_cloud": e.point_cloud,
+        "point_count": e.point_count,
         "state": e.state,
         "action": e.action,
+        "success": e.success,
+        "time": e.time_s,
         "tracks": tracks.xyz_world,
         "visible": tracks.visible,
         "sigma": exact if tracks.quality is None else tracks.quality.sigma,
         "object_pose": np.zeros((len(e), 0), np.float32) if e.object_pose is None else e.object_pose,
-    }
-
-
-def _per_demo(e: Episode) -> dict[str, np.ndarray]:
-    return {
+    }, {
         "queries": e.queries.xyz_world,
         "query_role": e.query_role.astype(np.int8),
         "query_count": np.array([e.queries.count]),
     }
+
+
+def pictures_of(e: Episode, name: str) -> tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]:
+    """The same, of one kind of picture."""
+    values = getattr(e, name)
+    return {} if values is None else {name: values}, {}

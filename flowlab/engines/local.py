@@ -7,18 +7,14 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Self
 
 from pebble import ProcessExpired, ProcessPool
 
+from flowlab.engines.base import Receipt, Unit, UnitResult
 from flowlab.errors import FlowlabError
 from flowlab.files import is_running
-
-Unit = TypeVar("Unit")
-Receipt = TypeVar("Receipt")
 
 _WORKER_ENVIRONMENT = (
     "OMP_NUM_THREADS",
@@ -29,32 +25,6 @@ _WORKER_ENVIRONMENT = (
     "MALLOC_ARENA_MAX",
 )
 """All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
-
-
-@dataclass(frozen=True, slots=True)
-class UnitResult(Generic[Unit, Receipt]):
-    """What became of a unit: its receipt, or why there is none."""
-
-    unit: Unit
-    receipt: Receipt | None
-    failure: str = ""
-    """Traceback, or how the worker died."""
-
-
-class Engine(Protocol[Unit, Receipt]):
-    """Runs units of some kind and hands back outcomes as they come; units never exchange arrays through it."""
-
-    def submit(self, unit: Unit) -> None:
-        """Start a unit as soon as there is room."""
-        ...
-
-    def next_result(self) -> UnitResult[Unit, Receipt]:
-        """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
-        ...
-
-
-StartEngine = Callable[[Callable[[Unit], Receipt]], AbstractContextManager[Engine[Unit, Receipt]]]
-"""Makes an engine that does units with the given function; leaving the context stops it."""
 
 
 class LocalEngine(Generic[Unit, Receipt]):

@@ -5,13 +5,14 @@ diffusion step say. Both enter as a sum, so what the condition says is worked ou
 steps of sampling.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from flowlab.policies.settings import DenoiserSettings
+from flowlab.nets.settings import DenoiserSettings
 
 Terms = list[Tensor]
 """Scale and shift of every block: (B, K, 2 C) for B conditions and K steps of each."""
@@ -39,12 +40,12 @@ class FiLM(nn.Module):
 
     def __init__(self, condition: int, step: int, channels: int) -> None:
         super().__init__()
-        self.of_condition = nn.Linear(condition, 2 * channels)
-        self.of_step = nn.Linear(step, 2 * channels, bias=False)
+        self.condition_layer = nn.Linear(condition, 2 * channels)
+        self.step_layer = nn.Linear(step, 2 * channels, bias=False)
 
     def forward(self, condition: Tensor, embedding: Tensor, step: Tensor) -> Tensor:
         """Terms for conditions (B, D) at steps (B, K), given the vectors of all steps: (B, K, 2 C)."""
-        return self.of_condition(condition)[:, None] + functional.embedding(step, self.of_step(embedding))
+        return self.condition_layer(condition)[:, None] + functional.embedding(step, self.step_layer(embedding))
 
 
 def modulate(x: Tensor, terms: Tensor) -> Tensor:
@@ -53,8 +54,8 @@ def modulate(x: Tensor, terms: Tensor) -> Tensor:
     return torch.addcmul(x + shift, x, scale)
 
 
-class Denoiser(nn.Module):
-    """A network of FiLM-modulated blocks; :meth:`terms` once per condition, :meth:`denoise` once per step."""
+class FiLMNetwork(nn.Module):
+    """A network of FiLM-modulated blocks: :meth:`terms` once per condition, then the blocks once per step."""
 
     def __init__(self, condition: int, steps: int, embedding: int, channels: Sequence[int]) -> None:
         super().__init__()
@@ -66,9 +67,13 @@ class Denoiser(nn.Module):
         c, e = functional.mish(condition), functional.mish(self.embedding())
         return [film(c, e, step) for film in self.films]
 
+
+class Denoiser(FiLMNetwork, ABC):
+    """A network that denoises sequences."""
+
+    @abstractmethod
     def denoise(self, x: Tensor, terms: Terms) -> Tensor:
         """The clean sequences behind noised ones (B K, T, C); terms are (B, K, 2 C)."""
-        raise NotImplementedError
 
 
 def make_denoiser(settings: DenoiserSettings, horizon: int, channels: int, condition: int, steps: int) -> Denoiser:
@@ -97,19 +102,19 @@ class MLPDenoiser(Denoiser):
     def __init__(self, settings: DenoiserSettings, horizon: int, channels: int, condition: int, steps: int) -> None:
         super().__init__(condition, steps, settings.step_embedding, settings.widths)
         width = settings.widths[0]
-        self.enter = nn.Linear(horizon * channels, width)
+        self.input_layer = nn.Linear(horizon * channels, width)
         self.blocks = nn.ModuleList(ResidualBlock(w) for w in settings.widths)
-        self.leave = nn.Linear(width, horizon * channels)
+        self.output_layer = nn.Linear(width, horizon * channels)
 
     def denoise(self, x: Tensor, terms: Terms) -> Tensor:
         """See :class:`Denoiser`."""
-        h = self.enter(x.flatten(1))
+        h = self.input_layer(x.flatten(1))
         for block, term in zip(self.blocks, terms, strict=True):
             h = block(h, term.flatten(0, 1))
-        return self.leave(h).view(x.shape)
+        return self.output_layer(h).view(x.shape)
 
 
-class PointSetDenoiser(Denoiser):
+class PointSetDenoiser(FiLMNetwork):
     """One network for all query points of a scene, over each one's whole sequence; they share their mean and maximum.
 
     A permutation of the queries permutes the result.
@@ -118,19 +123,19 @@ class PointSetDenoiser(Denoiser):
     def __init__(self, settings: DenoiserSettings, horizon: int, local: int, condition: int, steps: int) -> None:
         super().__init__(condition, steps, settings.step_embedding, settings.widths)
         width = settings.widths[0]
-        self.of_motion = nn.Linear(3 * horizon, width)
-        self.of_place = nn.Linear(local, width, bias=False)
+        self.motion_layer = nn.Linear(3 * horizon, width)
+        self.query_layer = nn.Linear(local, width, bias=False)
         self.blocks = nn.ModuleList(ResidualBlock(w) for w in settings.widths)
         self.mix = nn.ModuleList(nn.Linear(2 * w, w) for w in settings.widths)
-        self.leave = nn.Linear(width, 3 * horizon)
+        self.output_layer = nn.Linear(width, 3 * horizon)
 
-    def denoise_points(self, x: Tensor, place: Tensor, terms: Terms) -> Tensor:
-        """The clean motion behind (B, M, 3 T), for points whose ``of_place`` vectors (B, M, C) are given."""
-        h = self.of_motion(x) + place
+    def denoise_points(self, x: Tensor, queries: Tensor, terms: Terms) -> Tensor:
+        """The clean motion behind (B, M, 3 T), for points whose ``query_layer`` vectors (B, M, C) are given."""
+        h = self.motion_layer(x) + queries
         for block, mix, term in zip(self.blocks, self.mix, terms, strict=True):
             shared = mix(torch.cat([h.mean(1), h.amax(1)], -1))
             h = block(h + shared[:, None], term.flatten(0, 1))
-        return self.leave(h)
+        return self.output_layer(h)
 
 
 class Conv(nn.Module):
@@ -188,11 +193,11 @@ class UNetBlock(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.a, self.b = ConvBlock(inputs, outputs), ConvBlock(outputs, outputs)
-        self.past = nn.Linear(inputs, outputs) if inputs != outputs else nn.Identity()
+        self.skip = nn.Linear(inputs, outputs) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor, terms: Tensor) -> Tensor:
         """(B, T, C) -> (B, T, C'), with terms (B, 2 C')."""
-        return self.b(modulate(self.a(x), terms)) + self.past(x)
+        return self.b(modulate(self.a(x), terms)) + self.skip(x)
 
 
 class UNetDenoiser(Denoiser):
@@ -204,22 +209,22 @@ class UNetDenoiser(Denoiser):
         super().__init__(condition, steps, settings.step_embedding, [*widths, widths[-1], *widths[-2::-1]])
         pairs = list(zip([channels, *widths[:-1]], widths, strict=True))
         self.down = nn.ModuleList(UNetBlock(i, o) for i, o in pairs)
-        self.shorten = nn.ModuleList(Conv(w, w, 3, stride=2) for w in widths[:-1])
+        self.downsample = nn.ModuleList(Conv(w, w, 3, stride=2) for w in widths[:-1])
         self.middle = UNetBlock(widths[-1], widths[-1])
         self.up = nn.ModuleList(UNetBlock(2 * o, i) for i, o in pairs[:0:-1])
-        self.lengthen = nn.ModuleList(Upsample(i) for i, _ in pairs[:0:-1])
-        self.leave = nn.Sequential(ConvBlock(widths[0], widths[0]), nn.Linear(widths[0], channels))
+        self.upsample = nn.ModuleList(Upsample(i) for i, _ in pairs[:0:-1])
+        self.output_layer = nn.Sequential(ConvBlock(widths[0], widths[0]), nn.Linear(widths[0], channels))
 
     def denoise(self, x: Tensor, terms: Terms) -> Tensor:
         """See :class:`Denoiser`."""
-        asked = iter([t.flatten(0, 1) for t in terms])
-        past = []
+        film = iter([t.flatten(0, 1) for t in terms])
+        skipped = []
         for k, block in enumerate(self.down):
-            x = block(x, next(asked))
-            past.append(x)
-            if k < len(self.shorten):
-                x = self.shorten[k](x)
-        x = self.middle(x, next(asked))
-        for block, lengthen in zip(self.up, self.lengthen, strict=True):
-            x = lengthen(block(torch.cat([x, past.pop()], -1), next(asked)))
-        return self.leave(x)
+            x = block(x, next(film))
+            skipped.append(x)
+            if k < len(self.downsample):
+                x = self.downsample[k](x)
+        x = self.middle(x, next(film))
+        for block, upsample in zip(self.up, self.upsample, strict=True):
+            x = upsample(block(torch.cat([x, skipped.pop()], -1), next(film)))
+        return self.output_layer(x)

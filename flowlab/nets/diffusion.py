@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 
 class Diffusion(nn.Module):
@@ -18,33 +20,38 @@ class Diffusion(nn.Module):
     alphas_cumprod: Tensor
     """(train_steps,): share of the clean sample's variance that is left after each step."""
 
-    def __init__(self, train_steps: int = 100, inference_steps: int = 10) -> None:
+    def __init__(self, train_steps: int = 100, inference_steps: int = 10, loss: Literal["l1", "mse"] = "l1") -> None:
         super().__init__()
+        self._distance = functional.l1_loss if loss == "l1" else functional.mse_loss
 
         def level(t: float) -> float:
             return math.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
 
         beta = [min(1 - level((i + 1) / train_steps) / level(i / train_steps), 0.999) for i in range(train_steps)]
-        kept = torch.cumprod(1 - torch.tensor(beta, dtype=torch.float32), 0)
-        self.register_buffer("alphas_cumprod", kept, persistent=False)
+        alphas_cumprod = torch.cumprod(1 - torch.tensor(beta, dtype=torch.float32), 0)
+        self.register_buffer("alphas_cumprod", alphas_cumprod, persistent=False)
         self.train_steps = train_steps
         stride = train_steps // inference_steps
         self.steps = tuple(range(0, train_steps, stride))[::-1]
         """Those gone through in use, from noise to clean."""
 
+    def distance(self, predicted: Tensor, clean: Tensor) -> Tensor:
+        """How far a prediction is from the clean sample, number by number."""
+        return self._distance(predicted, clean, reduction="none")
+
     def noised(self, clean: Tensor, noise: Tensor, step: Tensor) -> Tensor:
         """The clean sample (B..., ...) as it is after ``step`` (B...) steps of noise."""
-        kept = self.alphas_cumprod[step].reshape(*step.shape, *[1] * (clean.ndim - step.ndim))
-        return kept.sqrt() * clean + (1 - kept).sqrt() * noise
+        alpha = self.alphas_cumprod[step].reshape(*step.shape, *[1] * (clean.ndim - step.ndim))
+        return alpha.sqrt() * clean + (1 - alpha).sqrt() * noise
 
     def sample(self, denoise: Callable[[Tensor, int], Tensor], noise: Tensor, clip: float) -> Tensor:
         """From noise to a clean sample; ``denoise(x, k)`` predicts it from what is left at ``self.steps[k]``."""
         x = noise
         for k, step in enumerate(self.steps):
             clean = denoise(x, k)
-            kept = self.alphas_cumprod[step]
-            residue = (x - kept.sqrt() * clean) / (1 - kept).sqrt()
-            after = self.alphas_cumprod[self.steps[k + 1]] if k + 1 < len(self.steps) else torch.ones_like(kept)
+            alpha = self.alphas_cumprod[step]
+            residue = (x - alpha.sqrt() * clean) / (1 - alpha).sqrt()
+            after = self.alphas_cumprod[self.steps[k + 1]] if k + 1 < len(self.steps) else torch.ones_like(alpha)
             x = after.sqrt() * clean.clamp(-clip, clip) + (1 - after).sqrt() * residue
         return x
 

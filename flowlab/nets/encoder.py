@@ -22,7 +22,7 @@ class PointNet(nn.Module):
     def __init__(self, widths: Sequence[int], features: int, octaves: int) -> None:
         super().__init__()
         self.octaves = octaves
-        self.point_features = widths[-1]
+        self.point_width = widths[-1]
         """Length of a point's own vector."""
         inputs = [3 + 6 * octaves, *widths[:-1]]
         self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip(inputs, widths, strict=True))
@@ -30,7 +30,7 @@ class PointNet(nn.Module):
         self.project = nn.Linear(widths[-1], features)
         self.norm = nn.LayerNorm(features)
 
-    def of_points(self, xyz: Tensor) -> Tensor:
+    def encode_points(self, xyz: Tensor) -> Tensor:
         """Every point's own vector: (..., 3) -> (..., C)."""
         h = self._fourier(xyz)
         for layer, norm in zip(self.layers, self.norms, strict=True):
@@ -49,19 +49,19 @@ class PointNet(nn.Module):
             row = where + size * torch.arange(clouds, device=points.device)[:, None]  # (B, C)
             wanted = torch.zeros(clouds * size, dtype=torch.bool, device=points.device)
             wanted[row.reshape(-1)] = True
-            place = torch.cumsum(wanted, 0) - 1
+            position = torch.cumsum(wanted, 0) - 1
             chosen = wanted.nonzero()[:, 0]
             # Few different sizes, so that memory and kernels made for one step serve the next; row 0 fills up, unused.
             chosen = functional.pad(chosen, (0, -len(chosen) % _ROWS))
-            critical = self.of_points(points.reshape(-1, 3)[chosen])
-            greatest = critical.gather(0, place[row])
+            critical = self.encode_points(points.reshape(-1, 3)[chosen])
+            greatest = critical.gather(0, position[row])
         return self.norm(self.project(greatest))
 
     def _maximum(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Maximum over each cloud's points and which point has it: two of (B, C)."""
         at_once = max(1, _ROWS // points.shape[1]) if points.device.type == "cpu" else len(points)
         with torch.no_grad():
-            both = [_greatest(self.of_points(chunk)) for chunk in torch.split(points, at_once)]
+            both = [_greatest(self.encode_points(chunk)) for chunk in torch.split(points, at_once)]
         return torch.cat([values for values, _ in both]), torch.cat([where for _, where in both])
 
     def _fourier(self, xyz: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def _greatest(h: Tensor) -> tuple[Tensor, Tensor]:
     return values, block * _BLOCK + inside
 
 
-def layers(widths: Sequence[int]) -> nn.Sequential:
+def linear_layers(widths: Sequence[int]) -> nn.Sequential:
     """Linear layers with ReLU between them."""
     parts: list[nn.Module] = []
     for i, o in pairwise(widths):

@@ -1,15 +1,17 @@
 """What is predicted before the action: how query points, or the object, will move."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from flowlab.nets.denoiser import Conv, PointSetDenoiser, Terms, make_denoiser
 from flowlab.nets.diffusion import Diffusion, NoiseSampler
-from flowlab.nets.encoder import PointNet, layers
-from flowlab.policies.settings import TrainSettings
+from flowlab.nets.encoder import PointNet, linear_layers
+from flowlab.nets.settings import MotionSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,19 +19,23 @@ class MotionLoss:
     """What a motion network makes of demonstrations in a training step."""
 
     loss: Tensor
+    """A number."""
     summary: Tensor | None
     """(W, features): what the action is conditioned on; None where it is not."""
 
 
-class MotionHead(nn.Module):
-    """Diffusion over a motion (W, ...) in normalized units, and a summary of it for the action."""
+class MotionHead(nn.Module, ABC):
+    """Diffusion over a motion in normalized units, and a summary of it for the action.
 
-    def __init__(self, settings: TrainSettings, diffusion: Diffusion, clip: float) -> None:
+    Its network has the motion in a layout of its own, (W, ...), which :meth:`pack` makes and :meth:`unpack` takes back.
+    """
+
+    def __init__(self, settings: MotionSettings, diffusion: Diffusion, clip: float) -> None:
         super().__init__()
-        self.settings = settings.motion
+        self.settings = settings
         self.diffusion = diffusion
         self.clip = clip
-        self.distance = functional.l1_loss if settings.diffusion.loss == "l1" else functional.mse_loss
+        """Greatest value of a normalized motion."""
 
     @property
     def features(self) -> int:
@@ -37,39 +43,52 @@ class MotionHead(nn.Module):
         return 0 if self.settings.condition == "auxiliary" else self.settings.features
 
     def compute_loss(
-        self, truth: Tensor, weight: Tensor, condition: Tensor, places: Tensor, draws: NoiseSampler, windows: int
+        self,
+        target: Tensor,
+        weight: Tensor,
+        condition: Float[Tensor, "W D"],
+        queries: Tensor | None,
+        noise: NoiseSampler,
+        windows: int,
     ) -> MotionLoss:
-        """The loss for true motions, and the summary the action is trained with.
+        """The loss for demonstrated motions, and the summary that the action is trained with.
 
-        ``condition`` (W, D) is the observation, ``places`` (W, M, ...) what is known of where the queries are, and
-        ``windows`` the size of the whole batch, of which this process may have a part.
+        Args:
+            target: (W, ...), the motions in the network's layout.
+            weight: (W, ...), how much each number counts; broadcasts.
+            condition: The observation.
+            queries: (W, M, F), a vector for each query point; None where the motion is not that of points.
+            noise: Where the noise comes from.
+            windows: The size of the whole batch, of which this process may have a part.
         """
         mode = self.settings.condition
-        step = draws.steps(self.diffusion.train_steps, windows)
+        step = noise.steps(self.diffusion.train_steps, windows)
         if mode == "one-step":
             step = torch.full_like(step, self.diffusion.train_steps - 1)
-        noise = draws.normal(windows, *truth.shape[1:])
-        known = self.place_terms(places, condition)
+        drawn = noise.normal(windows, *target.shape[1:])
+        known = self.query_terms(queries, condition)
         denoised = self.denoise(
-            self.diffusion.noised(truth, noise, step), known, self.terms(condition, known, step[:, None])
+            self.diffusion.noised(target, drawn, step), known, self.terms(condition, known, step[:, None])
         )
-        loss = (self.distance(denoised, truth, reduction="none") * weight).mean()
+        loss = (self.diffusion.distance(denoised, target) * weight).mean()
         if mode == "auxiliary":
             return MotionLoss(loss, None)
         if mode in ("clean", "one-step"):
             seen = denoised.detach()
         else:
-            seen = truth
+            seen = target
             if mode == "truth-noised":
-                seen = truth + self.settings.condition_noise * draws.normal(windows, *truth.shape[1:])
+                seen = target + self.settings.condition_noise * noise.normal(windows, *target.shape[1:])
         return MotionLoss(loss, self.summarize(seen.clamp(-self.clip, self.clip), known))
 
-    def predict(self, noise: Tensor, condition: Tensor, places: Tensor) -> tuple[Tensor, Tensor | None]:
+    def predict(
+        self, noise: Tensor, condition: Float[Tensor, "W D"], queries: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         """The motion that an observation leads to, from noise (W, ...), and its summary."""
-        known = self.place_terms(places, condition)
+        known = self.query_terms(queries, condition)
         mode = self.settings.condition
         if mode == "one-step":
-            motion = self._at_once(noise, condition, known)
+            motion = self._in_one_step(noise, condition, known)
         else:
             step = torch.tensor(self.diffusion.steps, device=noise.device).expand(len(noise), -1)
             terms = self.terms(condition, known, step)
@@ -81,54 +100,77 @@ class MotionHead(nn.Module):
         motion = motion.clamp(-self.clip, self.clip)
         return motion, None if mode == "auxiliary" else self.summarize(motion, known)
 
-    def _at_once(self, noise: Tensor, condition: Tensor, known: Tensor) -> Tensor:
+    def _in_one_step(self, noise: Tensor, condition: Tensor, known: Tensor) -> Tensor:
         last = torch.full((len(noise), 1), self.diffusion.train_steps - 1, device=noise.device)
         return self.denoise(noise, known, self.terms(condition, known, last)).clamp(-self.clip, self.clip)
 
-    def place_terms(self, places: Tensor, condition: Tensor) -> Tensor:
-        """What the network needs to know of the places of the queries, worked out once."""
-        raise NotImplementedError
+    @abstractmethod
+    def sample_shape(self, queries: int) -> tuple[int, ...]:
+        """Shape of one window's motion in the network's layout, for so many query points."""
 
+    @abstractmethod
+    def pack(self, motion: Tensor) -> Tensor:
+        """Motions (W, T, ...) in the network's layout (W, ...)."""
+
+    @abstractmethod
+    def unpack(self, packed: Tensor) -> Tensor:
+        """Motions (W, T, ...) again."""
+
+    @abstractmethod
+    def query_terms(self, queries: Tensor | None, condition: Tensor) -> Tensor:
+        """What the network needs to know of the query points, worked out once."""
+
+    @abstractmethod
     def terms(self, condition: Tensor, known: Tensor, step: Tensor) -> Terms:
         """Modulation for steps (W, K)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def denoise(self, x: Tensor, known: Tensor, terms: Terms) -> Tensor:
-        """The clean motion behind a noised one."""
-        raise NotImplementedError
+        """The clean motion behind a noised one, both in the network's layout."""
 
+    @abstractmethod
     def summarize(self, motion: Tensor, known: Tensor) -> Tensor:
         """A vector for each motion: temporal convolution, then the average over all steps (the paper's)."""
-        raise NotImplementedError
 
 
 class SequenceMotionHead(MotionHead):
-    """One sequence (W, T, C): the object's pose (MBA), or all queries' flow as channels (3D FDP, literal reading).
+    """A motion as one sequence (W, T, C).
 
-    ``queries`` is their number, 0 for a pose. What is known of their places is projected, query by query, together
-    with the observation, and all of it conditions the network.
+    What is known of M query points is projected, point by point, together with the observation, and all of it
+    conditions the network.
     """
 
     _PROJECTED = 16
 
     def __init__(
-        self, settings: TrainSettings, diffusion: Diffusion, clip: float, condition: int, channels: int, queries: int
+        self,
+        settings: MotionSettings,
+        diffusion: Diffusion,
+        clip: float,
+        horizon: int,
+        condition: int,
+        channels: int,
+        queries: int,
     ) -> None:
         super().__init__(settings, diffusion, clip)
-        self.project = nn.Linear(settings.motion.features + condition, self._PROJECTED) if queries else None
+        self.horizon, self.channels = horizon, channels
+        self.query_projection = nn.Linear(settings.features + condition, self._PROJECTED) if queries else None
         whole = condition + queries * self._PROJECTED
-        train_steps = settings.diffusion.train_steps
-        self.network = make_denoiser(settings.motion.denoiser, settings.horizon, channels, whole, train_steps)
+        self.network = make_denoiser(settings.denoiser, horizon, channels, whole, diffusion.train_steps)
         if self.features:
-            self.convolve = Conv(channels, self.features, 5)
-            self.leave = nn.Linear(self.features, self.features)
+            self.summary_layer = Conv(channels, self.features, 5)
+            self.summary_output = nn.Linear(self.features, self.features)
 
-    def place_terms(self, places: Tensor, condition: Tensor) -> Tensor:
+    def sample_shape(self, queries: int) -> tuple[int, ...]:
         """See :class:`MotionHead`."""
-        if self.project is None:
+        return self.horizon, self.channels
+
+    def query_terms(self, queries: Tensor | None, condition: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        if self.query_projection is None or queries is None:
             return condition
-        together = torch.cat([places, condition[:, None].expand(-1, places.shape[1], -1)], -1)
-        return torch.cat([condition, self.project(together).flatten(1)], -1)
+        together = torch.cat([queries, condition[:, None].expand(-1, queries.shape[1], -1)], -1)
+        return torch.cat([condition, self.query_projection(together).flatten(1)], -1)
 
     def terms(self, condition: Tensor, known: Tensor, step: Tensor) -> Terms:
         """See :class:`MotionHead`."""
@@ -140,29 +182,76 @@ class SequenceMotionHead(MotionHead):
 
     def summarize(self, motion: Tensor, known: Tensor) -> Tensor:
         """See :class:`MotionHead`."""
-        return self.leave(functional.mish(self.convolve(motion)).mean(1))
+        return self.summary_output(functional.mish(self.summary_layer(motion)).mean(1))
 
 
-class PointMotionHead(MotionHead):
-    """Flow (W, M, 3 T) by one network for all queries, in whatever order and number they come.
+class PoseHead(SequenceMotionHead):
+    """The pose (W, T, 9) of an object."""
 
-    The temporal convolution of the summary is as wide as the horizon; it sees where each query is, and its results
-    are averaged over the queries, beside their maximum.
+    def __init__(
+        self, settings: MotionSettings, diffusion: Diffusion, clip: float, horizon: int, condition: int
+    ) -> None:
+        super().__init__(settings, diffusion, clip, horizon, condition, channels=9, queries=0)
+
+    def pack(self, motion: Tensor) -> Tensor:
+        """See :class:`MotionHead`: a pose is a sequence as it is."""
+        return motion
+
+    def unpack(self, packed: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        return packed
+
+
+class ChannelFlowHead(SequenceMotionHead):
+    """The flow (W, T, M, 3) of M query points as the channels of one sequence: 3D FDP read to the letter."""
+
+    def __init__(
+        self, settings: MotionSettings, diffusion: Diffusion, clip: float, horizon: int, condition: int, queries: int
+    ) -> None:
+        super().__init__(settings, diffusion, clip, horizon, condition, channels=3 * queries, queries=queries)
+
+    def pack(self, motion: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        return motion.flatten(2)
+
+    def unpack(self, packed: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        return packed.view(len(packed), self.horizon, -1, 3)
+
+
+class PerQueryFlowHead(MotionHead):
+    """The flow (W, T, M, 3) of query points by one network for all, in whatever order and number they come.
+
+    The temporal convolution of the summary is as wide as the horizon; it sees where each query point is, and its
+    results are averaged over the points, beside their maximum.
     """
 
-    def __init__(self, settings: TrainSettings, diffusion: Diffusion, clip: float, condition: int) -> None:
+    def __init__(
+        self, settings: MotionSettings, diffusion: Diffusion, clip: float, horizon: int, condition: int
+    ) -> None:
         super().__init__(settings, diffusion, clip)
-        local, horizon = settings.motion.features, settings.horizon
-        self.network = PointSetDenoiser(
-            settings.motion.denoiser, horizon, local, condition, settings.diffusion.train_steps
-        )
+        self.horizon = horizon
+        self.network = PointSetDenoiser(settings.denoiser, horizon, settings.features, condition, diffusion.train_steps)
         if self.features:
-            self.convolve = layers([3 * horizon + local, self.features, self.features])
-            self.leave = nn.Linear(2 * self.features, self.features)
+            self.summary_layer = linear_layers([3 * horizon + settings.features, self.features, self.features])
+            self.summary_output = nn.Linear(2 * self.features, self.features)
 
-    def place_terms(self, places: Tensor, condition: Tensor) -> Tensor:
+    def sample_shape(self, queries: int) -> tuple[int, ...]:
         """See :class:`MotionHead`."""
-        return places
+        return queries, 3 * self.horizon
+
+    def pack(self, motion: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        return motion.transpose(1, 2).flatten(2)
+
+    def unpack(self, packed: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        return packed.view(len(packed), -1, self.horizon, 3).transpose(1, 2)
+
+    def query_terms(self, queries: Tensor | None, condition: Tensor) -> Tensor:
+        """See :class:`MotionHead`."""
+        assert queries is not None
+        return queries
 
     def terms(self, condition: Tensor, known: Tensor, step: Tensor) -> Terms:
         """See :class:`MotionHead`."""
@@ -170,21 +259,21 @@ class PointMotionHead(MotionHead):
 
     def denoise(self, x: Tensor, known: Tensor, terms: Terms) -> Tensor:
         """See :class:`MotionHead`."""
-        return self.network.denoise_points(x, self.network.of_place(known), terms)
+        return self.network.denoise_points(x, self.network.query_layer(known), terms)
 
     def summarize(self, motion: Tensor, known: Tensor) -> Tensor:
         """See :class:`MotionHead`."""
-        h = functional.relu(self.convolve(torch.cat([motion, known], -1)))
-        return self.leave(torch.cat([h.mean(1), h.amax(1)], -1))
+        h = functional.relu(self.summary_layer(torch.cat([motion, known], -1)))
+        return self.summary_output(torch.cat([h.mean(1), h.amax(1)], -1))
 
 
 class QueryEncoder(nn.Module):
-    """What is known of where queries are: the encoder's view of each point, and its coordinates (W, M, 3)."""
+    """A vector for each query point: the encoder's view of the point, and its coordinates."""
 
     def __init__(self, encoder: PointNet, features: int) -> None:
         super().__init__()
-        self.layers = layers([encoder.point_features + 3, features, features])
+        self.layers = linear_layers([encoder.point_width + 3, features, features])
 
-    def forward(self, encoder: PointNet, xyz: Tensor) -> Tensor:
-        """(W, M, 3) -> (W, M, features)."""
-        return self.layers(torch.cat([encoder.of_points(xyz), xyz], -1))
+    def forward(self, encoder: PointNet, xyz: Float[Tensor, "W M 3"]) -> Float[Tensor, "W M features"]:
+        """The vectors of points in the coordinates that the encoder knows."""
+        return self.layers(torch.cat([encoder.encode_points(xyz), xyz], -1))

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowlab.engines.local import Engine, StartEngine, UnitResult
+from flowlab.engines.base import Engine, StartEngine, UnitResult
 from flowlab.errors import FlowlabError, MissingFileError, UnfinishedError
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, SeedScheduler, UnitScheduler

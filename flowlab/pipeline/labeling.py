@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flowlab.engines.local import StartEngine
+from flowlab.engines.base import StartEngine
 from flowlab.errors import DataError, UsageError
 from flowlab.pipeline.extraction import fill
 from flowlab.pipeline.recipe import Recipe
@@ -18,7 +18,7 @@ from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.stages.recording import QualityStage, RecordingStage, TrackStage
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.recordings.metadata import FILE_NAME, combine, load_metadata
-from flowlab.recordings.recording import Description, Recording, RecordingSettings, describe, find_recordings
+from flowlab.recordings.recording import Recording, RecordingDescription, RecordingSettings, describe, find_recordings
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest, Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
@@ -36,7 +36,7 @@ def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) ->
     """
     settings = recording_stage(recipe)
     found = []
-    for path in find_recordings(paths):
+    for path in find_recordings(paths, settings.reader):
         place = Path(os.path.abspath(path))
         name = task or _task_said(place, settings) or place.parent.name
         if not name or "/" in name or name.startswith("."):
@@ -153,7 +153,7 @@ def _coverage(stage: TrackStage, steps: int) -> float:
     return sum(min(length, steps - start) for start in range(0, steps - 1, stride)) / steps
 
 
-def inspect_recording(recipe: Recipe, recorded: Recorded) -> Description | DataError:
+def inspect_recording(recipe: Recipe, recorded: Recorded) -> RecordingDescription | DataError:
     """What is recognized of a recording, or why nothing is."""
     try:
         return describe(Path(recorded.source), recording_stage(recipe))

@@ -20,7 +20,8 @@ from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, UsageError
 from flowlab.files import read_json, remove_leftovers, temporary_path, write_json
-from flowlab.policies.base import PolicyNetwork, PolicySpec
+from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
+from flowlab.policies.migrations import FORMAT, migrate_policy, migrate_tensor
 from flowlab.storage.manifest import differences
 from flowlab.version import __version__
 
@@ -28,7 +29,6 @@ POLICY = "policy.json"
 RUN = "run.json"
 RESUME = "resume.safetensors"
 CHECKPOINTS = "checkpoints"
-_FORMAT = 1
 _ADVICE = "delete it to use the checkpoint before it"
 Model = TypeVar("Model", bound=Settings)
 
@@ -36,7 +36,7 @@ Model = TypeVar("Model", bound=Settings)
 class TrainedPolicy(Settings):
     """``policy.json``: what a policy is, and what it was trained on."""
 
-    format: int = _FORMAT
+    format: int = FORMAT
     policy: PolicySpec
     dataset: str
     """Path of the dataset as it was given."""
@@ -52,14 +52,14 @@ class TrainedPolicy(Settings):
     @classmethod
     def now(cls, policy: PolicySpec, source: TrainingSource, buffer: ReplayBuffer) -> "TrainedPolicy":
         """A policy trained on a source by this flowlab."""
-        expert = source.settings.get("expert")
-        seeds = {t: tuple(d.seed for d in buffer.demos if d.task == t) for t in buffer.tasks}
+        about = source.provenance
+        seeds = {t: tuple(e.seed for e in buffer.episodes if e.task == t) for t in buffer.tasks}
         return cls(
             policy=policy,
             dataset=str(source.path),
             fingerprint=source.fingerprint,
-            scene_seeds=seeds if expert else {},
-            scene=expert["scene"] if expert else None,
+            scene_seeds=seeds if about.is_simulated else {},
+            scene=about.scene,
             versions={"flowlab": __version__, "torch": torch.__version__, "numpy": numpy.__version__},
         )
 
@@ -70,8 +70,9 @@ class RunConfig(Settings):
     dataset: Path
     steps: int
     train: tuple[int, ...]
-    """Demonstrations trained on, by their position in the corpus."""
+    """Episodes trained on, by their position in the :class:`~flowlab.data.replay_buffer.ReplayBuffer`."""
     held_out: tuple[int, ...]
+    """Episodes to validate on."""
     threads: int
     device: str
     precision: str
@@ -95,13 +96,18 @@ class LoadedPolicy:
 def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     """The policy of a run, with its newest weights, or of one checkpoint of it.
 
-    Raises :class:`DataError` where there is none, or it is damaged.
+    Args:
+        path: Folder of a run, or one of its checkpoints.
+        device: Where it computes.
+
+    Raises:
+        DataError: There is none, it is damaged, or its policy is not installed here.
     """
     weights = path if path.suffix == ".safetensors" else newest_checkpoint(path)
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
     tensors, step = _read(weights, _ADVICE)
-    policy = PolicyNetwork(trained.policy).requires_grad_(False).eval()
+    policy = make_policy(trained.policy).requires_grad_(False).eval()
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:
@@ -112,10 +118,10 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
 def newest_checkpoint(run: Path) -> Path:
     """The weights of a run that have seen most steps. Raises :class:`DataError` where there are none."""
     read_trained(run)
-    kept = sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
-    if not kept:
+    checkpoints = sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
+    if not checkpoints:
         raise DataError(f"{run}: has no checkpoint yet; resume it with 'flowlab train {run} --resume'")
-    return kept[-1]
+    return checkpoints[-1]
 
 
 def step_of(weights: Path) -> int:
@@ -142,7 +148,7 @@ def read_run_config(folder: Path) -> RunConfig:
 
 def check_observer(trained: TrainedPolicy, where: Path, source: TrainingSource) -> None:
     """Refuse data whose clouds were made with other settings than those a policy knows, showing the difference."""
-    mine, theirs = trained.policy.observer, source.observer
+    mine, theirs = trained.policy.observer, source.provenance.observer
     if mine is None and theirs is None:
         return
     lines = list(differences(json.loads(json.dumps(theirs)), json.loads(json.dumps(mine)), "observer"))
@@ -159,14 +165,14 @@ def save_weights(folder: Path, policy: PolicyNetwork, step: int) -> Path:
     path = folder / CHECKPOINTS / f"step-{step:08d}.safetensors"
     path.parent.mkdir(exist_ok=True)
     remove_leftovers(path.parent)
-    _write(path, policy.state_dict(), {"step": str(step)})
+    _write(path, policy.state_dict(), step)
     return path
 
 
 def save_resume(folder: Path, step: int, groups: Mapping[str, Mapping[str, Tensor]]) -> None:
     """Keep everything that goes on changing: named groups of tensors, as they are after ``step`` steps."""
     tensors = {f"{group}:{name}": value for group, values in groups.items() for name, value in values.items()}
-    _write(folder / RESUME, tensors, {"step": str(step)})
+    _write(folder / RESUME, tensors, step)
 
 
 def read_resume(folder: Path) -> tuple[int, dict[str, dict[str, Tensor]]]:
@@ -190,7 +196,7 @@ def writing_run(folder: Path) -> Iterator[None]:
     except (OSError, safetensors.SafetensorError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise DataError(
-            f"{folder}: cannot be written ({reason}); what was kept before is whole. Make room, then go on with "
+            f"{folder}: cannot be written ({reason}); what was saved before is whole. Make room, then go on with "
             f"'flowlab train {folder} --resume'"
         ) from error
 
@@ -207,7 +213,8 @@ def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig) -> None:
         write_json(folder / RUN, json.loads(run.model_dump_json()))
 
 
-def _write(path: Path, tensors: Mapping[str, Tensor], about: dict[str, str]) -> None:
+def _write(path: Path, tensors: Mapping[str, Tensor], step: int) -> None:
+    about = {"step": str(step), "format": str(FORMAT)}
     temporary = temporary_path(path)
     try:
         with writing_run(path.parent if path.name == RESUME else path.parents[1]):
@@ -222,7 +229,10 @@ def _read(path: Path, advice: str) -> tuple[dict[str, Tensor], int]:
     with _understood(path, advice):
         with safetensors.safe_open(path, "pt") as file:
             about = file.metadata() or {}
-        return load_file(path), int(about["step"])
+        tensors, step = load_file(path), int(about["step"])
+        if int(about.get("format", 1)) < FORMAT:
+            tensors = {migrate_tensor(name): value for name, value in tensors.items()}
+        return tensors, step
 
 
 @contextmanager
@@ -239,11 +249,15 @@ def _understood(path: Path, advice: str) -> Iterator[None]:
 
 
 def _validated(model: type[Model], path: Path) -> Model:
-    values: Any = read_json(path)
-    found = values.get("format", _FORMAT) if isinstance(values, dict) else None
-    if found != _FORMAT:
-        raise DataError(f"{path}: format is {found}, this flowlab reads {_FORMAT}; use the flowlab that wrote it")
+    values: Any = migrate_policy(read_json(path)) if model is TrainedPolicy else read_json(path)
+    found = values.get("format", FORMAT) if isinstance(values, dict) else None
+    if found != FORMAT:
+        raise DataError(f"{path}: format is {found}, this flowlab reads {FORMAT}; use the flowlab that wrote it")
     try:
         return model.model_validate(values)
     except ValidationError as error:
         raise DataError(f"{path}: {explain(error, model)}") from error
+    except UsageError as error:
+        raise DataError(
+            f"{path}: {error}; install what has this policy, or put its module's folder on PYTHONPATH"
+        ) from error

@@ -1,6 +1,5 @@
 """Picture files: lists of them, and decoding that notices damage."""
 
-import re
 import zlib
 from collections.abc import Sequence
 from functools import partial
@@ -11,21 +10,17 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from flowlab.recordings.base import BadImage, ImageStream
+from flowlab.text import natural_key
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def natural_order(name: str) -> list[tuple[int, int | str]]:
-    """Sort key that puts ``frame2`` before ``frame10``."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
-
-
 def list_images(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     """The pictures of a folder in natural order; hidden files are no pictures."""
     found = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".")]
-    return sorted(found, key=lambda f: natural_order(f.name))
+    return sorted(found, key=lambda f: natural_key(f.name))
 
 
 def color_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"]) -> ImageStream:

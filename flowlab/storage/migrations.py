@@ -48,7 +48,8 @@ def _renamed(name: str, stage: Any) -> Any:
     return rename(dict(stage)) if rename is not None and isinstance(stage, Mapping) else stage
 
 
-def _observer(stage: Json) -> Json:
+def migrate_observer(stage: Json) -> Json:
+    """Settings of the Observer by their names of today."""
     stray = stage.get("remove_outliers")
     if isinstance(stray, Mapping):
         names = {"neighbours": "neighbors", "deviations": "std_ratio"}
@@ -60,7 +61,7 @@ def _track(stage: Json) -> Json:
     return stage | {"tracker": "rigid-bodies"} if stage.get("tracker") == "bodies" else stage
 
 
-_RENAMED: dict[str, Callable[[Json], Json]] = {"observer": _observer, "track": _track}
+_RENAMED: dict[str, Callable[[Json], Json]] = {"observer": migrate_observer, "track": _track}
 
 
 def _provenance(values: Json, settings: Mapping[str, Any]) -> Provenance:

@@ -18,6 +18,11 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Of ``malloc.h``."""
 
 
+def is_first_process() -> bool:
+    """Whether this is the process that writes and reports."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 class ProcessGroup:
     """This process among those that train together, and the device it computes on."""
 
@@ -40,7 +45,7 @@ class ProcessGroup:
             raise UsageError(f"--precision bf16: {self.device} has no units for it, and would be slower; use fp32")
         self.precision = precision
         torch.set_num_threads(threads)
-        _keep_freed_memory()
+        _reuse_freed_memory()
         if self.count > 1 and not distributed.is_initialized():
             distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
 
@@ -83,7 +88,7 @@ class ProcessGroup:
             distributed.all_reduce(together)
         return dict(zip(values, (together / self.count).tolist(), strict=True))
 
-    def agree(self, yes: bool) -> bool:
+    def any(self, yes: bool) -> bool:
         """Whether any process says yes; all get the same answer."""
         if self.count == 1:
             return yes
@@ -91,13 +96,13 @@ class ProcessGroup:
         distributed.all_reduce(votes)
         return bool(votes)
 
-    def tell(self, number: int) -> int:
+    def broadcast(self, number: int) -> int:
         """The first process's number, in all of them."""
         if self.count == 1:
             return number
-        told = torch.tensor(number, device=self.device)
-        distributed.broadcast(told, 0)
-        return int(told)
+        shared = torch.tensor(number, device=self.device)
+        distributed.broadcast(shared, 0)
+        return int(shared)
 
     def wait(self) -> None:
         """Until all processes are here."""
@@ -105,7 +110,7 @@ class ProcessGroup:
             distributed.barrier()
 
     def close(self) -> None:
-        """Part ways."""
+        """Leave the group."""
         if self.count > 1:
             distributed.destroy_process_group()
 
@@ -114,12 +119,12 @@ def has_bf16(device: torch.device) -> bool:
     """Whether a device multiplies matrices faster in bf16: two to four times, where it can at all."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch has none
-    return bool(tell().get("avx512_bf16"))
+    capabilities: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch has none
+    return bool(capabilities().get("avx512_bf16"))
 
 
-def _keep_freed_memory() -> None:
-    """Have glibc keep what is freed: else it hands every large array back and gets it anew, page by page, in each step.
+def _reuse_freed_memory() -> None:
+    """Have glibc reuse what is freed: else it hands every large array back and gets it anew in each step.
 
     A tenth of a training step's time. Elsewhere than on glibc nothing happens.
     """

@@ -17,16 +17,16 @@ class MetricsFile:
     def __init__(self, folder: Path, step: int, logs: Sequence[MetricsLogger] = ()) -> None:
         self.path = folder / METRICS
         self._logs = logs
-        kept = [line for line in _whole_lines(self.path) if json.loads(line)["step"] <= step] if step else []
-        write_atomically(self.path, "".join(line + "\n" for line in kept))
-        cpu_seconds_spent = json.loads(kept[-1]) if kept else {"cpu_s": 0.0, "wall_s": 0.0}
-        self._began = time.process_time() - cpu_seconds_spent["cpu_s"], time.monotonic() - cpu_seconds_spent["wall_s"]
+        before = [line for line in _whole_lines(self.path) if json.loads(line)["step"] <= step] if step else []
+        write_atomically(self.path, "".join(line + "\n" for line in before))
+        spent = json.loads(before[-1]) if before else {"cpu_s": 0.0, "wall_s": 0.0}
+        self._began = time.process_time() - spent["cpu_s"], time.monotonic() - spent["wall_s"]
 
     def write(self, kind: str, step: int, values: Mapping[str, float]) -> None:
         """Add a line of a kind (``train`` or ``validation``), with the CPU and clock time spent so far [s]."""
-        cpu_seconds_spent = {"cpu_s": time.process_time() - self._began[0], "wall_s": time.monotonic() - self._began[1]}
+        spent = {"cpu_s": time.process_time() - self._began[0], "wall_s": time.monotonic() - self._began[1]}
         with self.path.open("a") as file:
-            file.write(json.dumps({"kind": kind, "step": step, **values, **cpu_seconds_spent}) + "\n")
+            file.write(json.dumps({"kind": kind, "step": step, **values, **spent}) + "\n")
         for log in self._logs:
             log.write(step, {f"{kind}/{name}": value for name, value in values.items()})
 
@@ -50,15 +50,15 @@ class RunningMeans:
             self._sums[name] = self._sums.get(name, 0.0) + value
 
     def state(self) -> dict[str, float]:
-        """What :meth:`load` takes up; empty where nothing was added."""
+        """What :meth:`load_state` goes on from; empty where nothing was added."""
         return {"count": self._count, **self._sums} if self._count else {}
 
-    def load(self, state: Mapping[str, float]) -> None:
+    def load_state(self, state: Mapping[str, float]) -> None:
         """Go on from what :meth:`state` gave."""
         self._sums = {name: value for name, value in state.items() if name != "count"}
         self._count = int(state.get("count", 0))
 
-    def take(self) -> dict[str, float]:
+    def pop_means(self) -> dict[str, float]:
         """The means since the last call."""
         means = {name: total / max(self._count, 1) for name, total in self._sums.items()}
         self._sums, self._count = {}, 0

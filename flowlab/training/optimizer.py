@@ -1,4 +1,4 @@
-"""How weights change: AdamW for each module, a learning rate that rises and falls, a moving average."""
+"""How weights change: AdamW for each group, a learning rate that rises and falls, a moving average."""
 
 import copy
 import math
@@ -7,29 +7,29 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from flowlab.data.settings import OptimizerSettings
 from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.settings import OptimizerSettings
 
 Tensors = dict[str, Tensor]
 
 
 class Optimizers:
-    """One AdamW for each module that is trained apart, on one schedule."""
+    """One AdamW for each group of a policy's parameters, on one schedule."""
 
     def __init__(self, policy: PolicyNetwork, settings: OptimizerSettings, steps: int) -> None:
         self._settings = settings
         self._steps = steps
         self._warmup = max(1, min(settings.warmup_steps, steps // 10))
         self._names = {id(p): name for name, p in policy.named_parameters()}
-        self._of_module = {
-            part: torch.optim.AdamW(
+        self._by_group = {
+            group: torch.optim.AdamW(
                 [p for m in modules for p in m.parameters()],
                 lr=settings.learning_rate,
                 betas=settings.betas,
                 weight_decay=settings.weight_decay,
                 fused=True,
             )
-            for part, modules in policy.parameter_groups().items()
+            for group, modules in policy.parameter_groups().items()
         }
 
     def learning_rate(self, step: int) -> float:
@@ -40,7 +40,7 @@ class Optimizers:
     def update(self, step: int) -> None:
         """Move the weights along their gradients, and clear these."""
         rate = self.learning_rate(step)
-        for optimizer in self._of_module.values():
+        for optimizer in self._by_group.values():
             for group in optimizer.param_groups:
                 group["lr"] = rate
             optimizer.step()
@@ -50,14 +50,14 @@ class Optimizers:
         """The moments of every weight, by name."""
         return {f"{key}/{name}": value for name, _, state in self._each() for key, value in state.items()}
 
-    def load(self, tensors: Tensors) -> None:
-        """Take up the moments that :meth:`state` gave."""
+    def load_state(self, tensors: Tensors) -> None:
+        """Go on with the moments that :meth:`state` gave."""
         for name, (optimizer, parameter), _ in self._each():
             keys = ("step", "exp_avg", "exp_avg_sq")
             optimizer.state[parameter] = {k: tensors[f"{k}/{name}"].to(parameter.device) for k in keys}
 
     def _each(self) -> Iterator[tuple[str, tuple[torch.optim.Optimizer, Tensor], Tensors]]:
-        for optimizer in self._of_module.values():
+        for optimizer in self._by_group.values():
             for group in optimizer.param_groups:
                 for p in group["params"]:
                     yield self._names[id(p)], (optimizer, p), optimizer.state[p]
@@ -69,9 +69,9 @@ class EMA:
     def __init__(self, policy: PolicyNetwork, settings: OptimizerSettings) -> None:
         self.policy = copy.deepcopy(policy).requires_grad_(False).eval()
         self._settings = settings
-        self._mine: list[Tensor] = list(self.policy.parameters())
+        self._averaged: list[Tensor] = list(self.policy.parameters())
 
     def update(self, policy: PolicyNetwork, step: int) -> None:
         """Take in the weights after a step."""
-        kept = min(1 - (1 + step) ** -self._settings.ema_power, self._settings.ema_max)
-        torch._foreach_lerp_(self._mine, [p.detach() for p in policy.parameters()], 1 - kept)
+        decay = min(1 - (1 + step) ** -self._settings.ema_power, self._settings.ema_max)
+        torch._foreach_lerp_(self._averaged, [p.detach() for p in policy.parameters()], 1 - decay)

@@ -2,21 +2,22 @@
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from pydantic import PositiveInt
 
 from flowlab.config import Settings
-from flowlab.data.batches import query_settings
 from flowlab.data.channels import infer_channels
 from flowlab.data.normalizer import fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
+from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource, open_training_source
-from flowlab.errors import DataError, UsageError, unknown_name
-from flowlab.policies.base import PolicyNetwork, PolicySpec
+from flowlab.errors import DataError, UsageError
+from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (
     RunConfig,
     TrainedPolicy,
@@ -28,14 +29,15 @@ from flowlab.policies.checkpoint import (
     start_folder,
     writing_run,
 )
-from flowlab.policies.settings import TrainSettings
+from flowlab.registry import POLICIES
 from flowlab.training.distributed import ProcessGroup
-from flowlab.training.loggers import LOGS, make_logger
+from flowlab.training.loggers import check_loggers, make_logger
 from flowlab.training.metrics import MetricsFile
 from flowlab.training.trainer import Trainer, TrainingProgress
 
 _UNTIMED, _TIMED = 3, 12
 """Steps made to learn how long one takes."""
+Precision = Literal["auto", "fp32", "bf16"]
 
 
 class ComputeSettings(Settings):
@@ -43,10 +45,10 @@ class ComputeSettings(Settings):
 
     device: str = "auto"
     """``cpu``, ``cuda``, ``cuda:1``; ``auto`` is a GPU where there is one."""
-    threads: int = 1
+    threads: PositiveInt = 1
     """Of each process, on a CPU."""
-    precision: str = "auto"
-    """``fp32`` or ``bf16``; ``auto`` is bf16 where the device has units for it."""
+    precision: Precision = "auto"
+    """``auto`` is bf16 where the device has units for it."""
     logs: tuple[str, ...] = ()
     """Names of other places, see :func:`~flowlab.training.loggers.make_logger`."""
 
@@ -55,66 +57,85 @@ def prepare_run(
     data: Path,
     out: Path,
     settings: TrainSettings,
-    machine: ComputeSettings,
+    compute: ComputeSettings,
     *,
     overfit: int | None = None,
     began_from: Path | None = None,
 ) -> Trainer:
-    """A new run, ready to :func:`run`. ``overfit`` trains on the first demonstrations and validates on the same.
+    """A new run, ready to :func:`run`.
 
-    Raises :class:`DataError` or :class:`UsageError` where settings, data or weights do not fit each other; then
-    nothing is written but the decoded corpus.
+    Args:
+        data: The dataset, or a store in DP3's layout.
+        out: Folder of the run.
+        settings: Of its policy.
+        compute: What it computes on.
+        overfit: Train on so many demonstrations, the first ones, and validate on the same.
+        began_from: A run, or one of its checkpoints, that the first weights are taken from.
+
+    Raises:
+        DataError, UsageError: Settings, data or weights do not fit each other; then nothing is written but the decoded
+            dataset.
     """
-    for name in machine.logs:
-        if name not in LOGS:
-            raise unknown_name("log", name, LOGS)
-    processes = ProcessGroup(machine.device, machine.threads, machine.precision)
+    check_loggers(compute.logs)
+    processes = ProcessGroup(compute.device, compute.threads, compute.precision)
     processes.part(settings.batch.windows)
     source = open_training_source(data)
-    buffer = load_buffer(source, out)
+    buffer = load_buffer(source, out, settings.needs.pictures)
     train, held_out = buffer.split(settings.data.demonstrations, settings.data.held_out)
     if overfit is not None:
-        train = held_out = list(range(min(overfit, len(buffer.demos))))
-    policy = _make_policy(source, buffer, settings, began_from)
+        train = held_out = list(range(min(overfit, len(buffer.episodes))))
+    policy = _new_policy(source, buffer, settings, began_from)
     planned = RunConfig(
         dataset=data.resolve(),
         steps=_epochs_to_steps(buffer, train, settings),
         train=tuple(train),
         held_out=tuple(held_out),
-        threads=machine.threads,
+        threads=compute.threads,
         device=processes.device.type,
         precision=processes.precision,
-        logs=machine.logs,
+        logs=compute.logs,
         began_from=None if began_from is None else str(began_from),
     )
     if settings.run.minutes is not None and settings.run.steps is None:
         steps = _fitting_steps(Trainer(out, planned, copy.deepcopy(policy), buffer, processes), settings.run.minutes)
-        planned = planned.model_copy(update={"steps": processes.tell(steps)})
+        planned = planned.model_copy(update={"steps": processes.broadcast(steps)})
     trainer = Trainer(out, planned, policy, buffer, processes)
     if processes.is_first:
         start_folder(out, TrainedPolicy.now(policy.spec, source, buffer), planned)
-        trainer.keep()
+        trainer.save()
     processes.wait()
     return trainer
 
 
-def resume_run(folder: Path, **changes: Any) -> Trainer:
-    """A run that ended early, as it was after the last step that was kept; ``changes`` are those of its machine.
+def resume_run(
+    folder: Path,
+    *,
+    device: str | None = None,
+    threads: int | None = None,
+    precision: Precision | None = None,
+    logs: Sequence[str] | None = None,
+) -> Trainer:
+    """A run that ended early, as it was after the last step that was saved; it computes on what it did, but for what
+    is given.
 
-    Raises :class:`DataError` where the dataset is no longer what the run began with.
+    Raises:
+        DataError: The dataset is no longer what the run began with, or there is nothing to resume.
     """
-    kept, trained = read_run_config(folder), read_trained(folder)
-    kept = kept.model_copy(update=changes)
-    processes = ProcessGroup(kept.device, kept.threads, kept.precision)
-    source = open_training_source(kept.dataset)
+    began, trained = read_run_config(folder), read_trained(folder)
+    given = {"device": device, "threads": threads, "precision": precision, "logs": None if logs is None else (*logs,)}
+    config = began.model_copy(update={k: v for k, v in given.items() if v is not None})
+    check_loggers(config.logs)
+    processes = ProcessGroup(config.device, config.threads, config.precision)
+    source = open_training_source(config.dataset)
     check_observer(trained, folder, source)
     if source.fingerprint != trained.fingerprint:
         raise DataError(
-            f"{folder}: began with content {trained.fingerprint} of {kept.dataset}, now {source.fingerprint}; "
+            f"{folder}: began with content {trained.fingerprint} of {config.dataset}, now {source.fingerprint}; "
             "restore the dataset, or start a new run"
         )
     step, groups = read_resume(folder)
-    trainer = Trainer(folder, kept, PolicyNetwork(trained.policy), load_buffer(source, folder), processes)
+    buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
+    trainer = Trainer(folder, config, make_policy(trained.policy), buffer, processes)
     trainer.load_state(step, groups)
     return trainer
 
@@ -140,16 +161,13 @@ def _silent(progress: TrainingProgress) -> None:
     """Only the first process reports."""
 
 
-def _make_policy(
+def _new_policy(
     source: TrainingSource, buffer: ReplayBuffer, settings: TrainSettings, began_from: Path | None
 ) -> PolicyNetwork:
-    if settings.policy == "mba" and buffer.object_pose.shape[1] != 9:
-        raise DataError(
-            f"{source.path}: has no object poses, which mba learns to predict; train --policy fdp, which learns from "
-            "points, or dp3"
-        )
+    POLICIES.load(settings.policy).check_dataset(source.path, buffer, settings)
     loaded = None if began_from is None else load_policy(began_from)
     channels = infer_channels(source, buffer)
+    flow = settings.needs.flow
     spec = PolicySpec(
         settings=settings,
         state_width=buffer.state.shape[1],
@@ -157,15 +175,15 @@ def _make_policy(
         tasks=buffer.tasks,
         channels=channels,
         normalizer=fit_normalizer(source, buffer, channels, settings),
-        observer=source.observer,
-        queries={**source.queries, **query_settings(settings.motion)},
+        observer=source.provenance.observer,
+        queries={} if flow is None else {**(source.provenance.queries or {}), **flow.query_settings},
     )
     torch.manual_seed(settings.run.seed)
     if loaded is None:
-        return PolicyNetwork(spec)
+        return make_policy(spec)
     check_observer(loaded.trained, loaded.path, source)
     old = loaded.trained.policy
-    policy = PolicyNetwork(spec.model_copy(update={"normalizer": old.normalizer, "channels": old.channels}))
+    policy = make_policy(spec.model_copy(update={"normalizer": old.normalizer, "channels": old.channels}))
     try:
         policy.load_state_dict(loaded.policy.state_dict())
     except RuntimeError as error:
@@ -176,10 +194,10 @@ def _make_policy(
     return policy
 
 
-def _epochs_to_steps(buffer: ReplayBuffer, train: list[int], settings: TrainSettings) -> int:
+def _epochs_to_steps(buffer: ReplayBuffer, train: Sequence[int], settings: TrainSettings) -> int:
     if settings.run.steps is not None:
         return settings.run.steps
-    windows = sum(max(1, len(buffer.demos[d]) - settings.n_action_steps + 1) for d in train)
+    windows = sum(max(1, len(buffer.episodes[e]) - settings.n_action_steps + 1) for e in train)
     return max(1, round(settings.run.epochs * windows / settings.batch.windows))
 
 
@@ -202,6 +220,6 @@ def _fitting_steps(trial: Trainer, minutes: float) -> int:
     for _ in range(_UNTIMED):
         trial.train_step()
     per_step = float(np.median([seconds(trial.train_step) for _ in range(_TIMED)]))
-    needs_frame = trial.settings.run.validations if trial.run.held_out else 0
-    per_look = seconds(trial.validate) if needs_frame else 0.0
-    return max(1, int((60 * minutes - needs_frame * per_look) / per_step))
+    validations = trial.settings.run.validations if trial.run.held_out else 0
+    per_validation = seconds(trial.validate) if validations else 0.0
+    return max(1, int((60 * minutes - validations * per_validation) / per_step))

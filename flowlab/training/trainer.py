@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from flowlab.data.batches import BatchBuilder, WindowSampler, index_windows
+from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.data.window_sampler import WindowSampler, index_windows
 from flowlab.errors import DataError, FlowlabError
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicyNetwork
@@ -22,7 +23,7 @@ from flowlab.training.validation import validate
 _STEPS_PER_LINE = 50
 """Training steps behind one line of metrics."""
 _SECONDS_BETWEEN_SAVES = 300.0
-"""At least so often, what resuming needs is kept."""
+"""At least so often, what resuming needs is saved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class DivergedError(FlowlabError):
 
 
 class Trainer:
-    """Trains one policy on one corpus, in one or several processes."""
+    """Trains one policy on the demonstrations of one dataset, in one or several processes."""
 
     def __init__(
         self, folder: Path, run: RunConfig, policy: PolicyNetwork, buffer: ReplayBuffer, processes: ProcessGroup
@@ -56,7 +57,7 @@ class Trainer:
         self._builder = BatchBuilder(buffer, policy.spec.channels, settings, policy.spec.tasks)
         windows = index_windows(buffer, list(run.train), settings.n_action_steps)
         self._sampler = WindowSampler(windows, settings.batch.windows, settings.batch.segment, settings.run.seed)
-        self._looked_at = index_windows(buffer, list(run.held_out), settings.n_action_steps) if run.held_out else None
+        self._held_out = index_windows(buffer, list(run.held_out), settings.n_action_steps) if run.held_out else None
         self._means = RunningMeans()
         self.step = 0
 
@@ -70,12 +71,10 @@ class Trainer:
         windows = len(batch.observed)
         part = self.processes.part(windows)
         generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-        draws = NoiseSampler(generator, self.processes.device, part)
+        noise = NoiseSampler(generator, self.processes.device, part)
         with self.processes.autocast():
-            losses = self._network(batch.part(part).to(self.processes.device), draws, windows)
-        values = {"loss": losses.total, "action_loss": losses.action}
-        if losses.motion is not None:
-            values["motion_loss"] = losses.motion
+            losses = self._network(batch.part(part).to(self.processes.device), noise, windows)
+        values = {"loss": losses.total} | {f"{name}_loss": loss for name, loss in losses.parts.items()}
         numbers = self.processes.mean({k: v.detach() for k, v in values.items()})
         if not all(np.isfinite(v) for v in numbers.values()):
             raise self._diverged(f"the loss is {numbers['loss']}")
@@ -92,8 +91,8 @@ class Trainer:
         should_stop: Callable[[], bool] = lambda: False,
     ) -> bool:
         """Train to the end of the run; False where ``should_stop`` ended it earlier, to be resumed."""
-        needs_frame = _evenly(self.run.steps, self.settings.run.validations) if self._looked_at is not None else set()
-        keeps = _evenly(self.run.steps, self.settings.run.checkpoints)
+        validations = _evenly(self.run.steps, self.settings.run.validations) if self._held_out is not None else set()
+        checkpoints = _evenly(self.run.steps, self.settings.run.checkpoints)
         last = None
         began, last_save, done_before = time.monotonic(), time.monotonic(), self.step
         while self.step < self.run.steps:
@@ -101,19 +100,19 @@ class Trainer:
             at_line = self.step % _STEPS_PER_LINE == 0 or self.step == self.run.steps
             if at_line:
                 rate = (self.step - done_before) * self.settings.batch.windows / (time.monotonic() - began)
-                averages = self._means.take()
+                averages = self._means.pop_means()
                 learning_rate = self.optimizers.learning_rate(self.step - 1)
-                self._note(metrics, "train", averages | {"lr": learning_rate, "samples_per_s": rate})
-            if self.step in needs_frame:
+                self._log(metrics, "train", averages | {"lr": learning_rate, "samples_per_s": rate})
+            if self.step in validations:
                 last = self.validate()
-                self._note(metrics, "validation", last)
+                self._log(metrics, "validation", last)
             if at_line:
                 report(TrainingProgress(self.step, self.run.steps, rate, averages["loss"], last))
-            stop = self.processes.agree(should_stop())
-            if self.step in keeps:
-                self.keep(self.step)
-            if stop or self.processes.agree(at_line and time.monotonic() - last_save > _SECONDS_BETWEEN_SAVES):
-                self.keep()
+            stop = self.processes.any(should_stop())
+            if self.step in checkpoints:
+                self.save(self.step)
+            if stop or self.processes.any(at_line and time.monotonic() - last_save > _SECONDS_BETWEEN_SAVES):
+                self.save()
                 last_save = time.monotonic()
             if stop and self.step < self.run.steps:
                 return False
@@ -121,16 +120,16 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Errors of the averaged weights on held-out demonstrations."""
-        assert self._looked_at is not None
-        return validate(self.average.policy, self._builder, self._looked_at, self.processes.device)
+        assert self._held_out is not None
+        return validate(self.average.policy, self._builder, self._held_out, self.processes.device)
 
-    def _note(self, metrics: MetricsFile | None, kind: str, values: dict[str, float]) -> None:
+    def _log(self, metrics: MetricsFile | None, kind: str, values: dict[str, float]) -> None:
         if metrics is not None:
             with writing_run(self.folder):
                 metrics.write(kind, self.step, values)
 
-    def keep(self, checkpoint: int | None = None) -> None:
-        """Keep what resuming needs, and the weights as a checkpoint.
+    def save(self, checkpoint: int | None = None) -> None:
+        """Save what resuming needs, and the weights as a checkpoint.
 
         Raises :class:`DivergedError` where weights are not finite, before anything is written.
         """
@@ -154,10 +153,10 @@ class Trainer:
             self.policy.load_state_dict(groups["policy"])
             self.average.policy.load_state_dict(groups["average"])
             if step:
-                self.optimizers.load(groups["optimizer"])
+                self.optimizers.load_state(groups["optimizer"])
         except (KeyError, RuntimeError) as error:
             raise DataError(f"{self.folder}: its resume file does not fit its policy.json; start anew") from error
-        self._means.load({name: float(value) for name, value in groups.get("means", {}).items()})
+        self._means.load_state({name: float(value) for name, value in groups.get("means", {}).items()})
         self.step = step
 
     def _diverged(self, what: str) -> DivergedError:

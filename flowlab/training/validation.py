@@ -6,7 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flowlab.data.batches import Batch, BatchBuilder, WindowIndex
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch
+from flowlab.data.window_sampler import WindowIndex
 from flowlab.policies.base import ActionPlan, PolicyNetwork
 
 MOVING_M = 0.005
@@ -45,7 +47,7 @@ def portions(windows: WindowIndex) -> Iterator[WindowIndex]:
     """Evenly spaced windows, in handy portions; each a run of its own."""
     index = np.unique(np.linspace(0, len(windows.now) - 1, _WINDOWS).astype(int))
     for part in np.array_split(index, -(-len(index) // _AT_ONCE)):
-        yield WindowIndex(windows.demo[part], windows.now[part], np.zeros(len(part), int))
+        yield WindowIndex(windows.episode[part], windows.now[part], np.zeros(len(part), int))
 
 
 def _errors(policy: PolicyNetwork, batch: Batch, plan: ActionPlan) -> dict[str, tuple[Tensor, Tensor]]:

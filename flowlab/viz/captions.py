@@ -16,7 +16,7 @@ MOVING_M = 0.01
 def caption(episode: Episode, shown: int) -> str:
     """An episode in one line; ``shown`` is how many of the moving points have their trails drawn."""
     T, moves = len(episode), int(moving(episode).sum())
-    facts = [
+    parts = [
         f"{episode.task}, seed {episode.seed}",
         f"{T} steps, {episode.time_s[-1]:.2f} s",
         f"{int(episode.point_count[0])} cloud points",
@@ -24,7 +24,7 @@ def caption(episode: Episode, shown: int) -> str:
         f"{moves} of them move" + (f" ({shown} shown)" if shown < moves else ""),
         _outcome(episode),
     ]
-    return "   ·   ".join(facts)
+    return "   ·   ".join(parts)
 
 
 def _outcome(episode: Episode) -> str:

@@ -1,4 +1,4 @@
-"""The colors that recordings, stills and films share: tracks loud, by role or by stated error; clouds quiet."""
+"""The colors that recordings, stills and videos share: tracks loud, by role or by stated error; clouds quiet."""
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8

@@ -27,7 +27,7 @@ from flowlab.storage.dataset import Dataset
 Capture = pytest.CaptureFixture[str]
 TASK = "drawer-open"
 SHORT = (
-    *NETWORK, "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=1",
+    "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=1",
     "diffusion.inference_steps=2",
 )  # fmt: skip
 UNITS = [f"{TASK}-dp3", f"{TASK}-fdp", f"{TASK}-fdp-m4"]
@@ -39,7 +39,7 @@ TINY: dict[str, Any] = {
     "demonstrations": 2,
     "recipe": "metaworld",
     "query_points": 8,
-    "profile": "fast",
+    "profile": str(NETWORK),
     "minutes": 30,
     "set": [*SHORT],
     "seeds": [0],
@@ -325,7 +325,7 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "key that is missing": ({"minutes": None}, "minutes: Field required"),
     "value": ({"minutes": "soon"}, "minutes: "),
     "no time": ({"minutes": 0}, "minutes: "),
-    "setting": ({"set": ["motoin.points=3"]}, "no setting is called 'motoin'; did you mean motion?"),
+    "setting": ({"set": ["motoin.points=3"]}, "no setting of dp3 is called 'motoin'; there are: action, "),
     "profile": ({"profile": "fsat"}, "no profile is called 'fsat'; did you mean fast?"),
     "policy of a variant": (
         {"variants": [{"name": "a", "tasks": [TASK], "set": [], "policy": "fpd"}]}, "no policy is called 'fpd'",

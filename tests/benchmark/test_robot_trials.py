@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from synthetic import call_cli
 
-from flowlab.benchmark.robot_trials import RobotTrial, comparisons, read_robot_trials, robot_trial_tables, successes
+from flowlab.benchmark.robot_trials import RobotTrial, comparisons, read_robot_trials, successes
 from flowlab.errors import DataError
+from flowlab.report.tables import robot_trial_tables
 
 HEADER = "policy,task,trial,success\n"
 Capture = pytest.CaptureFixture[str]

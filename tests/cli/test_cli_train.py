@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from conftest import Cli
 from synthetic import SETTINGS, call_cli, files_below, make_dataset, make_episode, make_manifest, make_provenance
 from trained_runs import (
@@ -106,7 +105,7 @@ def test_a_program_reads_the_same_as_json(rolls: Path, tmp_path: Path, capsys: C
 
 def test_minutes_are_kept_to(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     """Also against a number of steps in the profile; and the learning rate has fallen by then."""
-    small = options(*NETWORK, "run.steps=7", "run.checkpoints=2")
+    small = "--profile", NETWORK, *options("run.steps=7", "run.checkpoints=2")
     train(capsys, rolls, "--policy", "dp3", "--out", tmp_path / "run", *small, "--minutes", "0.03", "--device", "cpu")
     *_, last = lines_of(tmp_path / "run")
     assert 0.6 < last["cpu_s"] / 1.8 < 1.4
@@ -155,14 +154,7 @@ def test_the_papers_networks_train(rolls: Path, tmp_path: Path, capsys: Capture)
 
 
 def test_a_profile_of_ones_own(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
-    values = yaml.safe_load((Path(__file__).parents[2] / "pipelines/train/fast.yaml").read_text())
-    for change in (*NETWORK, "run.minutes=null", "run.steps=11"):
-        *groups, name = change.partition("=")[0].split(".")
-        target = values
-        for group in groups:
-            target = target[group]
-        target[name] = yaml.safe_load(change.partition("=")[2])
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(values))
+    (tmp_path / "mine.yaml").write_text(f"extends: {NETWORK}\nrun: {{minutes: null, steps: 11}}\n")
     train(capsys, rolls, "--policy", "mba", "--profile", tmp_path / "mine.yaml", "--out", tmp_path / "run")
     check_run(tmp_path / "run", 11)
 
@@ -290,7 +282,7 @@ WRONG: dict[str, tuple[list[str], int, str]] = {
     "seed": (["--seed", "99999999999999999999"], 2, "seed"),
     "minutes without end": (["--minutes", "inf"], 2, "minutes"),
     "minutes that are no number": (["--minutes", "soon"], 2, "'soon' is not a valid float"),
-    "log": (["--log", "tensorbord"], 2, "no log is called 'tensorbord'; did you mean tensorboard?"),
+    "log": (["--log", "tensorbord"], 2, "no logger is called 'tensorbord'; did you mean tensorboard?"),
     "device": (["--device", "gpu"], 2, "--device gpu: "),
     "device nobody can train on": (["--device", "meta"], 2, "--device meta: "),
     "option": (["--polcy", "fdp"], 2, "No such option"),
@@ -333,7 +325,7 @@ def test_data_that_cannot_be_trained_on(tmp_path: Path, capsys: Capture) -> None
         ("nowhere", "fdp", "nowhere: there is no such folder"),
         ("else", "fdp", "else: not a flowlab dataset (it has no flowlab.json)"),
         ("empty", "fdp", "empty: there are no episodes to train on yet; run the command that makes the dataset again"),
-        ("no-poses", "mba", "no-poses: has no object poses, which mba learns to predict; train --policy fdp"),
+        ("no-poses", "mba", "no-poses: has no object poses, which mba is trained on; make the dataset with them"),
     ):
         command = ("train", tmp_path / name, "--policy", policy, "--out", tmp_path / "run", *SMALL)
         code, out, err = call_cli(capsys, *command)

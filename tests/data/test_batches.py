@@ -11,11 +11,16 @@ from builders import HAND, every_window, random_buffer, tiny_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowlab.data.batches import Batch, BatchBuilder, WindowIndex, WindowSampler, choose_queries, index_windows
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch
 from flowlab.data.channels import ChannelSpec
+from flowlab.data.needs import Needs
+from flowlab.data.query_points import choose_queries
 from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.data.settings import TrainSettings
+from flowlab.data.window_sampler import WindowIndex, WindowSampler, index_windows
 from flowlab.errors import DataError, UsageError
-from flowlab.policies.settings import TrainSettings
+from flowlab.policies.fdp import FDPSettings
 from flowlab.records import Role
 
 HISTORY, HORIZON = 2, 8
@@ -28,8 +33,16 @@ def builder(
     return BatchBuilder(buffer, layout or ChannelSpec(), settings, buffer.tasks)
 
 
-def fdp(*overrides: str) -> TrainSettings:
-    return tiny_settings("fdp", *overrides)
+class EverySettings(FDPSettings):
+    """Of a policy that needs whatever fdp needs, and the object's pose."""
+
+    @property
+    def needs(self) -> Needs:
+        return replace(super().needs, object_pose=True)
+
+
+def fdp(*overrides: str) -> Any:
+    return EverySettings.model_validate(tiny_settings("fdp", *overrides).model_dump())
 
 
 # Which windows there are.
@@ -48,7 +61,7 @@ def test_windows_are_those_of_dp3() -> None:
 def test_windows_of_chosen_demonstrations_lie_in_them() -> None:
     buffer = random_buffer([("a", 14), ("a", 9), ("b", 2), ("b", 11)])
     windows = index_windows(buffer, [3, 2, 0], n_action_steps=4)
-    found = list(zip(windows.demo.tolist(), windows.now.tolist(), strict=True))
+    found = list(zip(windows.episode.tolist(), windows.now.tolist(), strict=True))
     # The third has 2 steps, fewer than are executed, and still a window.
     assert found == [(3, 25 + k) for k in range(8)] + [(2, 23)] + [(0, k) for k in range(11)]
 
@@ -76,7 +89,7 @@ def test_an_epoch_deals_out_every_run_once(count: int, segment: int, runs: int, 
     for step in range(first_step, last_step + 1):
         windows = sampler.windows(step)
         assert len(windows.now) == runs * segment
-        assert (windows.demo == windows.now // 10).all(), "a window lost its demonstration"
+        assert (windows.episode == windows.now // 10).all(), "a window lost its demonstration"
         for r in range(runs):
             run = windows.now[windows.run == r]
             # Consecutive; what lies behind the last window is the first.
@@ -118,11 +131,11 @@ def test_windows_are_a_function_of_seed_and_step() -> None:
 # What they hold.
 
 
-def expected(buffer: ReplayBuffer, s: TrainSettings, demo: int, now: int) -> dict[str, np.ndarray]:
+def expected(buffer: ReplayBuffer, s: Any, demo: int, now: int) -> dict[str, np.ndarray]:
     """One window, by its definition; weights are not yet brought to a mean of 1."""
-    d = buffer.demos[demo]
+    d = buffer.episodes[demo]
     frames = [max(now - back, d.start) for back in reversed(range(s.n_obs_steps))]
-    chosen = choose_queries(buffer, s.motion)[demo]
+    chosen = choose_queries(buffer, s.needs.flow)[demo]
     rows: dict[str, list[Any]] = {n: [] for n in ("action", "action_weight", "flow", "flow_weight", "object_pose")}
     for k in range(s.horizon):
         row = now - (s.n_obs_steps - 1) + k
@@ -143,7 +156,7 @@ def expected(buffer: ReplayBuffer, s: TrainSettings, demo: int, now: int) -> dic
         rows["flow"].append(flow)
         rows["flow_weight"].append(weight)
     return {name: np.stack(values) for name, values in rows.items()} | {
-        "points": buffer.points[frames, : s.encoder.points],
+        "points": buffer.point_cloud[frames, : s.encoder.points],
         "state": buffer.state[frames],
         "queries": buffer.queries[demo, chosen],
         "task": np.array(buffer.tasks.index(d.task)),
@@ -171,7 +184,7 @@ def test_a_batch_holds_what_the_definitions_say(overrides: tuple[str, ...]) -> N
     buffer, s = random_buffer(), fdp(*overrides)
     windows = every_window(buffer, s)
     batch = builder(s, buffer).build(windows)
-    wanted = [expected(buffer, s, d, n) for d, n in zip(windows.demo, windows.now, strict=True)]
+    wanted = [expected(buffer, s, d, n) for d, n in zip(windows.episode, windows.now, strict=True)]
     for name in ("action_weight", "flow_weight"):
         mean = np.mean([w[name] for w in wanted])
         for w in wanted:
@@ -318,7 +331,9 @@ def test_what_is_not_known_to_be_a_place_stays() -> None:
 
 def test_variation_is_a_function_of_the_generator_and_leaves_the_corpus_alone() -> None:
     buffer, s = random_buffer(), fdp("batch.shift_m=0.1", "encoder.subset=7", "motion.subset=3")
-    before = {name: getattr(buffer, name).copy() for name in ("points", "state", "action", "object_pose", "queries")}
+    before = {
+        name: getattr(buffer, name).copy() for name in ("point_cloud", "state", "action", "object_pose", "queries")
+    }
     windows = every_window(buffer, s)
     a, b, c = (builder(s, buffer, HAND).build(windows, np.random.default_rng(seed)) for seed in (0, 0, 1))
     for name in ("points", "state", "queries", "action", "flow", "flow_weight", "object_pose"):
@@ -411,7 +426,7 @@ def scene_corpus(queries: int = 12) -> ReplayBuffer:
 
 
 def motion(*overrides: str) -> Any:
-    return fdp(*overrides).motion
+    return fdp(*overrides).needs.flow
 
 
 @pytest.mark.parametrize("wanted", [1, 5, 12])

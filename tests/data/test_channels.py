@@ -15,13 +15,13 @@ from flowlab.data.source import open_training_source
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 FIRST = (0, 1, 2)
 PER_STEP = ("time_s", "point_cloud", "point_count", "state", "action", "success", "object_pose")
 
 
-def layout_of(folder: Path, episodes: list[Episode], **changes: Any) -> ChannelSpec:
+def channels_of(folder: Path, episodes: list[Episode], **changes: Any) -> ChannelSpec:
     make_dataset(folder, [episodes], **changes)
     source = open_training_source(folder)
     return infer_channels(source, load_buffer(source, folder))
@@ -31,7 +31,7 @@ def layout_of(folder: Path, episodes: list[Episode], **changes: Any) -> ChannelS
 def test_of_simulation_it_is_known(tmp_path: Path, recipe: str) -> None:
     """Hand and both fingers are places; actions are displacements. DP3's frame is the camera's, its state's is not."""
     settings = load_recipe(recipe, []).settings()
-    found = layout_of(tmp_path / "d", [make_episode(k) for k in range(3)], settings=settings)
+    found = channels_of(tmp_path / "d", [make_episode(k) for k in range(3)], settings=settings)
     if recipe == "metaworld":
         assert found == ChannelSpec(
             gripper=FIRST, state_positions=(FIRST, (3, 4, 5), (6, 7, 8)), action_displacement=FIRST
@@ -41,7 +41,7 @@ def test_of_simulation_it_is_known(tmp_path: Path, recipe: str) -> None:
 
 
 def test_of_a_recording_whose_gripper_is_seen_and_sent_to_places(tmp_path: Path) -> None:
-    found = layout_of(tmp_path / "d", [recorded(k) for k in range(3)])
+    found = channels_of(tmp_path / "d", [recorded(k) for k in range(3)])
     assert found == ChannelSpec(gripper=FIRST, state_positions=(FIRST,), action_position=FIRST)
 
 
@@ -49,19 +49,19 @@ def test_displacements_are_no_places(tmp_path: Path) -> None:
     def displacement(position: np.ndarray) -> np.ndarray:
         return np.diff(position, axis=0, append=position[-1:])
 
-    found = layout_of(tmp_path / "d", [recorded(k, action=displacement) for k in range(3)])
+    found = channels_of(tmp_path / "d", [recorded(k, action=displacement) for k in range(3)])
     assert found == ChannelSpec(gripper=FIRST, state_positions=(FIRST,))
 
 
 def test_actions_of_two_numbers_are_no_places(tmp_path: Path) -> None:
     episodes = [replace(e, action=e.action[:, :2]) for e in map(recorded, range(3))]
-    assert layout_of(tmp_path / "d", episodes) == ChannelSpec(gripper=FIRST, state_positions=(FIRST,))
+    assert channels_of(tmp_path / "d", episodes) == ChannelSpec(gripper=FIRST, state_positions=(FIRST,))
 
 
 @pytest.mark.parametrize(("away", "seen"), [(0.13, True), (0.17, False)])
 def test_a_gripper_far_from_all_points_is_none(tmp_path: Path, away: float, seen: bool) -> None:
     """The ball's surface is 5 cm from its center; 10 cm from there is the limit."""
-    found = layout_of(tmp_path / "d", [recorded(k, away=away) for k in range(3)])
+    found = channels_of(tmp_path / "d", [recorded(k, away=away) for k in range(3)])
     assert (found.gripper is not None) == seen
     if not seen:
         assert found == ChannelSpec(), "then nothing is known to be in the frame of the points"
@@ -72,7 +72,7 @@ def test_actions_are_places_where_the_gripper_gets_there_in_a_step(tmp_path: Pat
     def missed(position: np.ndarray) -> np.ndarray:
         return np.concatenate([position[1:], position[-1:]]) + np.array([0, off, 0])
 
-    found = layout_of(tmp_path / "d", [recorded(k, action=missed) for k in range(3)])
+    found = channels_of(tmp_path / "d", [recorded(k, action=missed) for k in range(3)])
     assert (found.action_position == FIRST) == places
 
 
@@ -91,16 +91,16 @@ def test_actions_are_compared_with_where_the_gripper_is_a_step_later(tmp_path: P
 
     episodes = [fast(k) for k in range(3)]
     assert [len(e) for e in episodes] == [3, 3, 3]
-    assert layout_of(tmp_path / "d", episodes).action_position == FIRST
+    assert channels_of(tmp_path / "d", episodes).action_position == FIRST
 
 
 def test_a_state_of_two_numbers_has_no_place(tmp_path: Path) -> None:
     episodes = [replace(e, state=e.state[:, :2]) for e in map(recorded, range(3))]
-    assert layout_of(tmp_path / "d", episodes) == ChannelSpec()
+    assert channels_of(tmp_path / "d", episodes) == ChannelSpec()
 
 
 def test_of_a_store_in_dp3s_layout_nothing_is_known(tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[recorded(k) for k in range(3)]])
-    export_dp3(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
     source = open_training_source(tmp_path / "s.zarr")
     assert infer_channels(source, load_buffer(source, tmp_path)) == ChannelSpec()

@@ -12,11 +12,11 @@ from synthetic import make_dataset, make_episode, with_tracks
 from flowlab.data.channels import ChannelSpec, infer_channels
 from flowlab.data.normalizer import Normalizer, Scale, Scaler, fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
+from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource, open_training_source
-from flowlab.policies.settings import TrainSettings
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 FIRST = (0, 1, 2)
 
@@ -66,7 +66,7 @@ def test_where_scenes_are_turned_displacements_are_alike_in_all_directions(tmp_p
     assert plain.unit[1] < 0.3
 
 
-def test_what_never_changes_is_centerd_and_not_blown_up(tmp_path: Path) -> None:
+def test_what_never_changes_is_centered_and_not_blown_up(tmp_path: Path) -> None:
     def still(e: Episode) -> Episode:
         action = e.action.copy()
         action[:, 1] = 0.7 + np.linspace(0, 5e-5, len(e))
@@ -81,7 +81,7 @@ def test_what_never_changes_is_centerd_and_not_blown_up(tmp_path: Path) -> None:
 
 def test_points_keep_their_proportions(tmp_path: Path) -> None:
     episodes = [make_episode(k) for k in range(3)]
-    found = fitted(tmp_path / "d", episodes).place
+    found = fitted(tmp_path / "d", episodes).position
     assert found.unit[0] == found.unit[1] == found.unit[2]
     values = normal(all_of(episodes, "point_cloud"), found)
     longest = np.ptp(values, axis=0).argmax()
@@ -96,7 +96,7 @@ def test_relative_to_the_gripper_points_have_the_same_unit_and_the_gripper_is_ze
     absolute = fitted(tmp_path / "a", episodes, layout=layout)
     relative = fitted(tmp_path / "b", episodes, "encoder.relative=true", layout=layout)
     unknown = fitted(tmp_path / "c", episodes, "encoder.relative=true")
-    assert relative.place == Scale(offset=(0, 0, 0), unit=absolute.place.unit)
+    assert relative.position == Scale(offset=(0, 0, 0), unit=absolute.position.unit)
     assert unknown == absolute
     assert relative.action == absolute.action, "displacements are relative as they are"
     assert relative.state == absolute.state
@@ -154,20 +154,20 @@ def test_a_scene_in_which_nothing_moves_is_not_blown_up(tmp_path: Path, scale: s
 
 def test_without_flow_there_is_a_normalizer_too(tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[make_episode(k) for k in range(3)]])
-    export_dp3(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
     source = open_training_source(tmp_path / "s.zarr")
     settings = tiny_settings("dp3")
     found = fit_normalizer(source, load_buffer(source, tmp_path), ChannelSpec(), settings)
     dataset = open_training_source(tmp_path / "d")
     wanted = fit_normalizer(dataset, load_buffer(dataset, tmp_path), ChannelSpec(), settings)
-    for name in ("place", "state", "action"):
+    for name in ("position", "state", "action"):
         assert getattr(found, name) == getattr(wanted, name), name
 
 
 def relative_actions(buffer: ReplayBuffer, s: TrainSettings) -> np.ndarray:
     """Every action of every window, seen from the gripper as it is when the window is decided on."""
     found = []
-    for d in buffer.demos:
+    for d in buffer.episodes:
         for now in range(d.start, d.stop):
             for row in range(now - s.n_obs_steps + 1, now - s.n_obs_steps + 1 + s.horizon):
                 action = buffer.action[min(max(row, d.start), d.stop - 1)].copy()

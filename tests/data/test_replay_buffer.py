@@ -17,7 +17,7 @@ from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.errors import DataError
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 
 def make_episodes() -> list[Episode]:
@@ -37,13 +37,13 @@ def write(folder: Path, episodes: list[Episode]) -> TrainingSource:
 
 def check(buffer: ReplayBuffer, episodes: list[Episode]) -> None:
     wanted = sorted(episodes, key=lambda e: (e.task, e.seed))
-    assert [(d.task, d.seed, len(d)) for d in buffer.demos] == [(e.task, e.seed, len(e)) for e in wanted]
+    assert [(d.task, d.seed, len(d)) for d in buffer.episodes] == [(e.task, e.seed, len(e)) for e in wanted]
     assert len(buffer.state) == sum(map(len, wanted))
     rows = np.zeros(len(buffer.state), int)
-    for k, (demo, e) in enumerate(zip(buffer.demos, wanted, strict=True)):
+    for k, (demo, e) in enumerate(zip(buffer.episodes, wanted, strict=True)):
         mine = slice(demo.start, demo.stop)
         rows[mine] += 1
-        np.testing.assert_array_equal(buffer.points[mine], e.point_cloud)
+        np.testing.assert_array_equal(buffer.point_cloud[mine], e.point_cloud)
         np.testing.assert_array_equal(buffer.state[mine], e.state)
         np.testing.assert_array_equal(buffer.action[mine], e.action)
         np.testing.assert_array_equal(buffer.tracks[mine], e.tracks.xyz_world)
@@ -56,7 +56,7 @@ def check(buffer: ReplayBuffer, episodes: list[Episode]) -> None:
         np.testing.assert_array_equal(buffer.query_role[k], e.query_role)
         assert buffer.query_count[k] == e.queries.count
     assert (rows == 1).all(), "a row belongs to no demonstration, or to two"
-    assert buffer.points.dtype == buffer.tracks.dtype == buffer.sigma.dtype == np.float32
+    assert buffer.point_cloud.dtype == buffer.tracks.dtype == buffer.sigma.dtype == np.float32
 
 
 def test_a_corpus_is_its_dataset(tmp_path: Path) -> None:
@@ -71,10 +71,10 @@ def test_a_corpus_is_its_dataset(tmp_path: Path) -> None:
 def test_a_corpus_without_poses_or_tracks_has_none(tmp_path: Path) -> None:
     episodes = [make_episode(k, object_pose=False) for k in range(3)]
     check(load_buffer(write(tmp_path / "d", episodes), tmp_path / "run"), episodes)
-    export_dp3(Dataset(tmp_path / "d"), tmp_path / "store.zarr")
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "store.zarr")
     buffer = load_buffer(open_training_source(tmp_path / "store.zarr"), tmp_path / "run")
     np.testing.assert_array_equal(buffer.action, np.concatenate([e.action for e in episodes]))
-    assert [len(d) for d in buffer.demos] == [len(e) for e in episodes]
+    assert [len(d) for d in buffer.episodes] == [len(e) for e in episodes]
     assert buffer.tracks.shape == (36, 0, 3)
     assert buffer.queries.shape == (3, 0, 3)
 
@@ -140,7 +140,7 @@ def test_what_a_kill_left_half_made_is_made_again(tmp_path: Path) -> None:
     source = write(tmp_path / "d", episodes)
     load_buffer(source, tmp_path / "run")
     (cache,) = (tmp_path / "d" / "cache").iterdir()
-    (cache / "corpus.json").unlink()
+    (cache / "index.json").unlink()
     (cache / "action.npy").write_bytes(b"half")
     check(load_buffer(source, tmp_path / "run"), episodes)
 
@@ -181,7 +181,7 @@ def test_demonstrations_of_different_widths_are_refused(tmp_path: Path, field: s
         last = replace(last, **{field: getattr(last, field)[:, :3]})
     episodes = [make_episode(0), make_episode(1), last]
     source = replace(write(tmp_path / "d", episodes[:2]), episodes=lambda: iter(episodes), frames=36)
-    name = "points" if field == "point_cloud" else field
+    name = field
     with pytest.raises(
         DataError, match=rf"{tmp_path / 'd'}: roll seed 2: '{name}' is .* wide, .*; train on one of them"
     ):

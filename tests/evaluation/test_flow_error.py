@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flowlab.evaluation.flow_error import flow_error
-from flowlab.evaluation.trials import RolloutFlowError
+from flowlab.evaluation.results import RolloutFlowError
 from flowlab.geometry.transforms import apply, rigid
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, sample_queries

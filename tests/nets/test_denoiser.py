@@ -25,8 +25,9 @@ from flowlab.nets.denoiser import (
     make_denoiser,
     modulate,
 )
-from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.settings import DenoiserSettings, load_settings
+from flowlab.nets.settings import DenoiserSettings
+from flowlab.policies.base import make_policy
+from flowlab.policies.settings import load_settings
 
 HORIZON, CHANNELS, CONDITION, STEPS = 8, 3, 5, 20
 
@@ -95,8 +96,8 @@ def test_film_is_one_linear_layer_on_condition_and_step() -> None:
     film = FiLM(CONDITION, 8, 4)
     together = nn.Linear(CONDITION + 8, 8)
     with torch.no_grad():
-        together.weight.copy_(torch.cat([film.of_condition.weight, film.of_step.weight], 1))
-        together.bias.copy_(film.of_condition.bias)
+        together.weight.copy_(torch.cat([film.condition_layer.weight, film.step_layer.weight], 1))
+        together.bias.copy_(film.condition_layer.bias)
     condition, embedding, step = torch.randn(6, CONDITION), torch.randn(STEPS, 8), torch.randint(STEPS, (6, 3))
     terms = film(condition, embedding, step)
     for b in range(6):
@@ -123,7 +124,7 @@ def denoise(net: Denoiser, x: Tensor, condition: Tensor, step: Tensor) -> Tensor
     """Every draw of (B, K, ...), with the condition of its window."""
     terms = net.terms(condition, step)
     if isinstance(net, PointSetDenoiser):
-        place = net.of_place(torch.linspace(-1, 1, x.shape[2] * 4).view(x.shape[2], 4)).expand(len(x), -1, -1)
+        place = net.query_layer(torch.linspace(-1, 1, x.shape[2] * 4).view(x.shape[2], 4)).expand(len(x), -1, -1)
         return net.denoise_points(x.flatten(0, 1), place.repeat_interleave(x.shape[1], 0), terms).view(x.shape)
     return net.denoise(x.flatten(0, 1), terms).view(x.shape)
 
@@ -214,7 +215,6 @@ def test_a_per_query_network_is_not_a_unet() -> None:
     per_query = "motion.flow_representation=per-query"
     with pytest.raises(UsageError, match=r"layers of a per-query network are all alike, .*; found \[512, 1024, 2048\]"):
         load_settings("paper", "fdp", [per_query])
-    load_settings("paper", "dp3", [per_query])  # which has none
 
 
 def reference_block(block: UNetBlock, x: Tensor, terms: Tensor) -> Tensor:
@@ -226,8 +226,8 @@ def reference_block(block: UNetBlock, x: Tensor, terms: Tensor) -> Tensor:
 
     scale, shift = terms[..., None].chunk(2, 1)
     past = x
-    if isinstance(block.past, nn.Linear):
-        past = functional.conv1d(x, block.past.weight[..., None], block.past.bias)
+    if isinstance(block.skip, nn.Linear):
+        past = functional.conv1d(x, block.skip.weight[..., None], block.skip.bias)
     return conv_block(block.b, (1 + scale) * conv_block(block.a, x) + shift) + past
 
 
@@ -240,16 +240,16 @@ def test_the_unet_is_wired_as_diffusion_policys() -> None:
     terms = [t[:, 0] for t in net.terms(condition, step)]
     x = noised.transpose(1, 2)
     a = reference_block(net.down[0], x, terms[0])
-    half = functional.conv1d(a, conv_weight(net.shorten[0]), net.shorten[0].linear.bias, 2, 1)
+    half = functional.conv1d(a, conv_weight(net.downsample[0]), net.downsample[0].linear.bias, 2, 1)
     b = reference_block(net.down[1], half, terms[1])
-    quarter = functional.conv1d(b, conv_weight(net.shorten[1]), net.shorten[1].linear.bias, 2, 1)
+    quarter = functional.conv1d(b, conv_weight(net.downsample[1]), net.downsample[1].linear.bias, 2, 1)
     c = reference_block(net.down[2], quarter, terms[2])
     assert (a.shape[1:], b.shape[1:], c.shape[1:]) == ((8, 16), (16, 8), (24, 4))
     x = reference_block(net.middle, c, terms[3])
     for k, past in enumerate((c, b)):
         x = reference_block(net.up[k], torch.cat([x, past], 1), terms[4 + k])
-        x = functional.conv_transpose1d(x, *transposed_weight(net.lengthen[k]), 2, 1)
-    out, last = net.leave
+        x = functional.conv_transpose1d(x, *transposed_weight(net.upsample[k]), 2, 1)
+    out, last = net.output_layer
     x = functional.conv1d(x, conv_weight(out.conv), out.conv.linear.bias, padding=2)
     x = last(functional.mish(functional.group_norm(x, 8, out.weight, out.bias)).transpose(1, 2))
     assert len(terms) == 6
@@ -258,7 +258,7 @@ def test_the_unet_is_wired_as_diffusion_policys() -> None:
 
 def test_a_unet_of_simpledp3s_size_has_its_number_of_weights() -> None:
     widths = "action={kind: unet, widths: [128, 256, 384], step_embedding: 128}"
-    policy = PolicyNetwork(tiny_spec(load_settings("paper", "dp3", [widths]), tasks=("roll",)))
+    policy = make_policy(tiny_spec(load_settings("paper", "dp3", [widths]), tasks=("roll",)))
     assert policy.spec.settings.horizon == 16
     assert sum(p.numel() for p in policy.parameters()) == pytest.approx(7.4e6, rel=0.01)
 
@@ -281,7 +281,7 @@ def test_an_mlp_sees_the_whole_sequence() -> None:
 
 def test_the_order_of_queries_does_not_matter() -> None:
     net = make_queries()
-    x, place = torch.randn(2, 6, 3 * HORIZON), net.of_place(torch.randn(2, 6, 4))
+    x, place = torch.randn(2, 6, 3 * HORIZON), net.query_layer(torch.randn(2, 6, 4))
     terms = net.terms(torch.randn(2, CONDITION), torch.randint(STEPS, (2, 1)))
     result, order = net.denoise_points(x, place, terms), torch.randperm(6)
     shuffled = net.denoise_points(x[:, order], place[:, order], terms)
@@ -303,6 +303,6 @@ def test_queries_hear_of_each_other_and_know_where_they_are() -> None:
 
 def test_a_profile_says_which_network_is_made() -> None:
     kinds = [
-        type(PolicyNetwork(tiny_spec(tiny_settings("dp3", f"action.kind={kind}"))).action) for kind in ("mlp", "unet")
+        type(make_policy(tiny_spec(tiny_settings("dp3", f"action.kind={kind}"))).action) for kind in ("mlp", "unet")
     ]
     assert kinds == [MLPDenoiser, UNetDenoiser]

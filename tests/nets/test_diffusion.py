@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from builders import draws
+from builders import sampler
 from torch import Tensor
 
 from flowlab.nets.diffusion import Diffusion, NoiseSampler
@@ -77,9 +77,9 @@ def test_parts_of_a_batch_get_what_the_whole_gets(parts: int) -> None:
     def drawn(d: NoiseSampler) -> tuple[Tensor, ...]:
         return d.steps(100, 8, 3), d.normal(8, 5, 2), d.steps(7, 8), d.normal(8)
 
-    whole = drawn(draws())
+    whole = drawn(sampler())
     size = 8 // parts
-    pieces = [drawn(draws(part=slice(k * size, (k + 1) * size))) for k in range(parts)]
+    pieces = [drawn(sampler(part=slice(k * size, (k + 1) * size))) for k in range(parts)]
     for k, numbers in enumerate(whole):
         assert all(len(p[k]) == size for p in pieces)
         assert torch.equal(torch.cat([p[k] for p in pieces]), numbers)
@@ -87,17 +87,17 @@ def test_parts_of_a_batch_get_what_the_whole_gets(parts: int) -> None:
 
 def test_draws_are_a_function_of_the_seed() -> None:
     torch.manual_seed(1)
-    first = draws(3).normal(4, 2)
+    first = sampler(3).normal(4, 2)
     torch.manual_seed(2)
-    assert torch.equal(draws(3).normal(4, 2), first)
-    assert not torch.equal(draws(4).normal(4, 2), first)
-    again = draws(3)
+    assert torch.equal(sampler(3).normal(4, 2), first)
+    assert not torch.equal(sampler(4).normal(4, 2), first)
+    again = sampler(3)
     again.normal(4, 2)
     assert not torch.equal(again.normal(4, 2), first), "a second draw repeats the first"
 
 
 def test_numbers_drawn_are_distributed_as_they_should_be() -> None:
-    steps, normal = draws().steps(20, 10_000, 4), draws().normal(10_000, 4)
+    steps, normal = sampler().steps(20, 10_000, 4), sampler().normal(10_000, 4)
     assert steps.shape == normal.shape == (10_000, 4)
     share = torch.bincount(steps.flatten(), minlength=20) / steps.numel()
     assert len(share) == 20

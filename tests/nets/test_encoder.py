@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from flowlab.nets import encoder
-from flowlab.nets.encoder import PointNet, layers
+from flowlab.nets.encoder import PointNet, linear_layers
 
 
 class Plain(nn.Module):
@@ -84,13 +84,13 @@ def test_values_and_gradients_are_those_of_a_plain_pointnet(
 def test_only_points_that_matter_go_through_with_a_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
     net = make_net((8, 4))
     rows: list[tuple[int, bool]] = []
-    of_points = net.of_points
+    encode_points = net.encode_points
 
     def counted(xyz: Tensor) -> Tensor:
         rows.append((xyz[..., 0].numel(), torch.is_grad_enabled()))
-        return of_points(xyz)
+        return encode_points(xyz)
 
-    monkeypatch.setattr(net, "of_points", counted)
+    monkeypatch.setattr(net, "encode_points", counted)
     monkeypatch.setattr(encoder, "_ROWS", 4)  # of which the number of points is made a multiple
     net(torch.randn(3, 200, 3, dtype=torch.float64))
     assert sum(n for n, with_gradient in rows if not with_gradient) == 600
@@ -101,7 +101,7 @@ def test_only_points_that_matter_go_through_with_a_gradient(monkeypatch: pytest.
     assert sum(n for n, _ in rows) == 600, "without a gradient once is enough"
 
 
-def test_the_order_and_repetition_of_points_do_not_matter() -> None:
+def test_the_order_and_repetition_encode_points_do_not_matter() -> None:
     net = make_net()
     points = torch.randn(2, 30, 3, dtype=torch.float64)
     shuffled = points[:, torch.randperm(30)]
@@ -113,10 +113,10 @@ def test_the_order_and_repetition_of_points_do_not_matter() -> None:
 def test_a_point_has_the_same_vector_wherever_it_is_asked_for() -> None:
     net = make_net()
     points = torch.randn(2, 5, 3, dtype=torch.float64)
-    of_points = net.of_points(points)
-    assert of_points.shape == (2, 5, net.point_features)
-    torch.testing.assert_close(net.of_points(points[1, 3]), of_points[1, 3])
-    torch.testing.assert_close(net.norm(net.project(of_points.amax(1))), net(points))
+    encode_points = net.encode_points(points)
+    assert encode_points.shape == (2, 5, net.point_width)
+    torch.testing.assert_close(net.encode_points(points[1, 3]), encode_points[1, 3])
+    torch.testing.assert_close(net.norm(net.project(encode_points.amax(1))), net(points))
 
 
 def test_fourier_features_are_sines_and_cosines_of_doubling_frequency() -> None:
@@ -144,7 +144,7 @@ def test_weights_learn_in_half_precision_too() -> None:
 
 
 def test_layers_have_relu_between_them_and_none_behind() -> None:
-    net = layers([3, 5, 2])
+    net = linear_layers([3, 5, 2])
     assert [type(m) for m in net] == [nn.Linear, nn.ReLU, nn.Linear]
     first, _, last = net
     x = torch.randn(4, 3)

@@ -4,13 +4,20 @@ from typing import Any
 
 import pytest
 import torch
-from builders import draws, tiny_settings
+from builders import sampler, tiny_settings
 from torch import Tensor
 from torch.nn import functional
 
 from flowlab.nets.diffusion import Diffusion
 from flowlab.nets.encoder import PointNet
-from flowlab.nets.motion import MotionHead, PointMotionHead, QueryEncoder, SequenceMotionHead
+from flowlab.nets.motion import (
+    ChannelFlowHead,
+    MotionHead,
+    PerQueryFlowHead,
+    PoseHead,
+    QueryEncoder,
+    SequenceMotionHead,
+)
 
 HORIZON, M, CONDITION, FEATURES, STEPS, CLIP = 8, 6, 5, 8, 100, 1.5
 LAYOUTS = ("channels", "per-query", "pose")
@@ -21,45 +28,45 @@ SHAPE = {"channels": (HORIZON, 3 * M), "per-query": (M, 3 * HORIZON), "pose": (H
 def make(layout: str, condition: str = "clean", *overrides: str) -> MotionHead:
     conditions = f"motion.condition='{condition}'", "motion.condition_noise=0.3", f"diffusion.train_steps={STEPS}"
     s = tiny_settings("fdp", *conditions, *overrides)
-    diffusion = Diffusion(STEPS, 5)
+    diffusion = Diffusion(STEPS, 5, s.diffusion.loss)
     torch.manual_seed(0)
     if layout == "per-query":
-        return PointMotionHead(s, diffusion, CLIP, CONDITION)
+        return PerQueryFlowHead(s.motion, diffusion, CLIP, HORIZON, CONDITION)
     if layout == "channels":
-        return SequenceMotionHead(s, diffusion, CLIP, CONDITION, 3 * M, M)
-    return SequenceMotionHead(s, diffusion, CLIP, CONDITION, 9, 0)
+        return ChannelFlowHead(s.motion, diffusion, CLIP, HORIZON, CONDITION, M)
+    return PoseHead(s.motion, diffusion, CLIP, HORIZON, CONDITION)
 
 
 def inputs(layout: str, windows: int = 4) -> dict[str, Tensor]:
-    """The arguments of ``learn``: some of the truth lies beyond the clip."""
+    """The arguments of ``compute_loss``: some of the truth lies beyond the clip."""
     random = torch.Generator().manual_seed(1)
-    places = (0, 3) if layout == "pose" else (M, FEATURES)
+    shape = (0, 3) if layout == "pose" else (M, FEATURES)
     return {
-        "truth": torch.randn(windows, *SHAPE[layout], generator=random),
+        "target": torch.randn(windows, *SHAPE[layout], generator=random),
         "weight": torch.rand(windows, *SHAPE[layout], generator=random),
         "condition": torch.randn(windows, CONDITION, generator=random),
-        "places": torch.randn(windows, *places, generator=random),
+        "queries": torch.randn(windows, *shape, generator=random),
     }
 
 
 def learn(motion: MotionHead, given: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
-    learned = motion.compute_loss(**given, draws=draws(), windows=len(given["truth"]))
+    learned = motion.compute_loss(**given, noise=sampler(), windows=len(given["target"]))
     return learned.loss, learned.summary
 
 
 def drawn(layout: str, windows: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    """Steps, noise, and further noise, as ``learn`` draws them."""
-    d = draws()
+    """Steps, noise, and further noise, as ``compute_loss`` draws them."""
+    d = sampler()
     return d.steps(STEPS, windows), d.normal(windows, *SHAPE[layout]), d.normal(windows, *SHAPE[layout])
 
 
 def denoise(motion: MotionHead, x: Tensor, given: dict[str, Tensor], step: Tensor) -> Tensor:
-    known = motion.place_terms(given["places"], given["condition"])
+    known = motion.query_terms(given["queries"], given["condition"])
     return motion.denoise(x, known, motion.terms(given["condition"], known, step[:, None]))
 
 
 def summarize(motion: MotionHead, x: Tensor, given: dict[str, Tensor]) -> Tensor:
-    return motion.summarize(x, motion.place_terms(given["places"], given["condition"]))
+    return motion.summarize(x, motion.query_terms(given["queries"], given["condition"]))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -68,7 +75,7 @@ def test_the_loss_is_the_weighted_distance_to_the_clean_motion(layout: str, loss
     motion, given = make(layout, "clean", f"diffusion.loss={loss}"), inputs(layout)
     step, noise, _ = drawn(layout)
     kept = motion.diffusion.alphas_cumprod[step].view(-1, 1, 1)
-    away = denoise(motion, kept.sqrt() * given["truth"] + (1 - kept).sqrt() * noise, given, step) - given["truth"]
+    away = denoise(motion, kept.sqrt() * given["target"] + (1 - kept).sqrt() * noise, given, step) - given["target"]
     distance = away.abs() if loss == "l1" else away.square()
     torch.testing.assert_close(learn(motion, given)[0], (distance * given["weight"]).mean())
 
@@ -79,7 +86,7 @@ def test_what_has_no_weight_gives_no_gradient(layout: str, condition: str, monke
     motion, given = make(layout, condition), inputs(layout)
     masked = torch.rand(given["weight"].shape) < 0.5
     given["weight"] = given["weight"].masked_fill(masked, 0)
-    prediction = torch.zeros_like(given["truth"], requires_grad=True)
+    prediction = torch.zeros_like(given["target"], requires_grad=True)
     monkeypatch.setattr(motion, "denoise", lambda x, known, terms: prediction)
     (gradient,) = torch.autograd.grad(learn(motion, given)[0], prediction)
     assert (gradient[masked] == 0).all()
@@ -102,30 +109,30 @@ def reached(output: Tensor, **inputs: Any) -> set[str]:
 def test_the_action_does_not_teach_the_motion(layout: str, condition: str) -> None:
     """What conditions the action is taken as it is; only its summary learns from the action."""
     motion, given = make(layout, condition), inputs(layout)
-    for x in (given["places"], given["condition"]):
+    for x in (given["queries"], given["condition"]):
         x.requires_grad_()
     loss, summary = learn(motion, given)
-    parts = {"network": motion.network, "places": given["places"], "condition": given["condition"]}
+    parts = {"network": motion.network, "queries": given["queries"], "condition": given["condition"]}
     if layout == "pose":
-        del parts["places"]
+        del parts["queries"]
     assert reached(loss, **parts) == parts.keys()
     if condition == "auxiliary":
         assert summary is None
-        assert not hasattr(motion, "convolve"), "weights that nothing uses"
+        assert not hasattr(motion, "summary_layer"), "weights that nothing uses"
         return
     assert summary is not None
     assert summary.shape == (4, FEATURES)
-    by_summary = reached(summary, **parts, convolve=motion.convolve, leave=motion.leave)
+    by_summary = reached(summary, **parts, summary_layer=motion.summary_layer, summary_output=motion.summary_output)
     # A query's place is an input of the per-query summary itself.
-    assert by_summary == {"convolve", "leave"} | ({"places"} if layout == "per-query" else set())
-    assert reached(loss, convolve=motion.convolve, leave=motion.leave) == set()
+    assert by_summary == {"summary_layer", "summary_output"} | ({"queries"} if layout == "per-query" else set())
+    assert reached(loss, summary_layer=motion.summary_layer, summary_output=motion.summary_output) == set()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_clean_sees_what_the_network_makes_of_the_noised_motion(layout: str) -> None:
     motion, given = make(layout, "clean"), inputs(layout)
     step, noise, _ = drawn(layout)
-    seen = denoise(motion, motion.diffusion.noised(given["truth"], noise, step), given, step)
+    seen = denoise(motion, motion.diffusion.noised(given["target"], noise, step), given, step)
     motion.clip = 0.3
     assert seen.abs().max() > motion.clip
     wanted = summarize(motion, seen.clamp(-0.3, 0.3), given)
@@ -140,27 +147,27 @@ def test_one_step_sees_in_use_what_it_sees_in_training(layout: str) -> None:
     noise = drawn(layout)[1]
     guess = denoise(motion, noise, given, torch.full((4,), STEPS - 1))
     assert guess.abs().max() > 0.3
-    predicted, summary = motion.predict(noise, given["condition"], given["places"])
+    predicted, summary = motion.predict(noise, given["condition"], given["queries"])
     torch.testing.assert_close(predicted, guess.clamp(-0.3, 0.3))
     torch.testing.assert_close(summary, summarize(motion, predicted, given))
     loss, in_training = learn(motion, given)
     almost = {"rtol": 1e-2, "atol": 1e-3}
     torch.testing.assert_close(in_training, summary, **almost)
-    torch.testing.assert_close(loss, ((guess - given["truth"]).abs() * given["weight"]).mean(), **almost)
-    torch.testing.assert_close(learn(motion, given | {"truth": -given["truth"]})[1], summary, **almost)
+    torch.testing.assert_close(loss, ((guess - given["target"]).abs() * given["weight"]).mean(), **almost)
+    torch.testing.assert_close(learn(motion, given | {"target": -given["target"]})[1], summary, **almost)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_truth_sees_the_demonstrated_motion(layout: str) -> None:
     motion, given = make(layout, "truth"), inputs(layout)
-    assert given["truth"].abs().max() > CLIP
-    torch.testing.assert_close(learn(motion, given)[1], summarize(motion, given["truth"].clamp(-CLIP, CLIP), given))
+    assert given["target"].abs().max() > CLIP
+    torch.testing.assert_close(learn(motion, given)[1], summarize(motion, given["target"].clamp(-CLIP, CLIP), given))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_truth_noised_sees_it_with_noise(layout: str) -> None:
     motion, given = make(layout, "truth-noised"), inputs(layout)
-    noised = given["truth"] + 0.3 * drawn(layout)[2]
+    noised = given["target"] + 0.3 * drawn(layout)[2]
     torch.testing.assert_close(learn(motion, given)[1], summarize(motion, noised.clamp(-CLIP, CLIP), given))
 
 
@@ -170,7 +177,7 @@ def test_in_use_the_motion_is_sampled_and_summarized(layout: str, condition: str
     motion, given = make(layout, condition), inputs(layout)
     motion.clip = 0.2
     noise = torch.randn(4, *SHAPE[layout])
-    predicted, summary = motion.predict(noise, given["condition"], given["places"])
+    predicted, summary = motion.predict(noise, given["condition"], given["queries"])
     assert predicted.shape == noise.shape
     assert predicted.abs().max() <= 0.2
     if condition != "one-step":
@@ -188,51 +195,53 @@ def test_in_use_the_motion_is_sampled_and_summarized(layout: str, condition: str
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_motion_that_the_observation_decides_is_learned(layout: str) -> None:
     motion, given = make(layout), inputs(layout, windows=3)
-    given["truth"] = given["truth"].clamp(-1, 1)
+    given["target"] = given["target"].clamp(-1, 1)
     given["condition"] = 2 * torch.eye(3, CONDITION)
     given["weight"] = torch.ones_like(given["weight"])
     optimizer = torch.optim.Adam(motion.parameters(), 5e-3)
-    d, losses = draws(), []
+    d, losses = sampler(), []
     for _ in range(250):
-        loss = motion.compute_loss(**given, draws=d, windows=3).loss
+        loss = motion.compute_loss(**given, noise=d, windows=3).loss
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
     assert sum(losses[-10:]) / 10 < 0.35 * losses[0]
     with torch.no_grad():
-        found, _ = motion.predict(torch.randn_like(given["truth"]), given["condition"], given["places"])
-    assert (found - given["truth"]).abs().mean() < 0.35 * given["truth"].abs().mean()
+        found, _ = motion.predict(torch.randn_like(given["target"]), given["condition"], given["queries"])
+    assert (found - given["target"]).abs().mean() < 0.35 * given["target"].abs().mean()
 
 
 @pytest.mark.parametrize("layout", ["channels", "pose"])
 def test_a_sequence_is_summarized_by_convolution_and_the_mean_over_its_steps(layout: str) -> None:
     motion, given = make(layout), inputs(layout)
-    outputs, _ = motion.convolve.linear.weight.shape
-    weight = motion.convolve.linear.weight.view(outputs, 5, -1).transpose(1, 2)
-    h = functional.conv1d(given["truth"].transpose(1, 2), weight, motion.convolve.linear.bias, padding=2)
-    torch.testing.assert_close(summarize(motion, given["truth"], given), motion.leave(functional.mish(h).mean(2)))
+    outputs, _ = motion.summary_layer.linear.weight.shape
+    weight = motion.summary_layer.linear.weight.view(outputs, 5, -1).transpose(1, 2)
+    h = functional.conv1d(given["target"].transpose(1, 2), weight, motion.summary_layer.linear.bias, padding=2)
+    torch.testing.assert_close(
+        summarize(motion, given["target"], given), motion.summary_output(functional.mish(h).mean(2))
+    )
 
 
 def test_the_places_of_queries_reach_the_network_of_channels_each_at_its_own_entry() -> None:
     motion, given = make("channels"), inputs("channels")
     assert isinstance(motion, SequenceMotionHead)
-    assert motion.project is not None
-    known = motion.place_terms(given["places"], given["condition"])
+    assert motion.query_projection is not None
+    known = motion.query_terms(given["queries"], given["condition"])
     torch.testing.assert_close(known[:, :CONDITION], given["condition"])
     for m in range(M):
-        wanted = motion.project(torch.cat([given["places"][:, m], given["condition"]], -1))
+        wanted = motion.query_projection(torch.cat([given["queries"][:, m], given["condition"]], -1))
         torch.testing.assert_close(known[:, CONDITION:].view(4, M, -1)[:, m], wanted)
 
 
 def test_the_order_and_number_of_queries_are_free_per_query() -> None:
     motion, given = make("per-query"), inputs("per-query")
-    noise, order = torch.randn_like(given["truth"]), torch.randperm(M)
-    predicted, summary = motion.predict(noise, given["condition"], given["places"])
-    shuffled, same = motion.predict(noise[:, order], given["condition"], given["places"][:, order])
+    noise, order = torch.randn_like(given["target"]), torch.randperm(M)
+    predicted, summary = motion.predict(noise, given["condition"], given["queries"])
+    shuffled, same = motion.predict(noise[:, order], given["condition"], given["queries"][:, order])
     torch.testing.assert_close(shuffled, predicted[:, order], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(same, summary, rtol=1e-4, atol=1e-5)
-    many, _ = motion.predict(torch.randn(4, 3 * M, 3 * HORIZON), given["condition"], given["places"].repeat(1, 3, 1))
+    many, _ = motion.predict(torch.randn(4, 3 * M, 3 * HORIZON), given["condition"], given["queries"].repeat(1, 3, 1))
     assert many.shape == (4, 3 * M, 3 * HORIZON)
 
 
@@ -243,6 +252,6 @@ def test_a_place_is_what_the_encoder_sees_there_and_its_coordinates() -> None:
     found = places(encoder, xyz)
     assert found.shape == (4, M, FEATURES)
     first, _, last = places.layers
-    seen = torch.cat([encoder.of_points(xyz[2, 3]), xyz[2, 3]])
+    seen = torch.cat([encoder.encode_points(xyz[2, 3]), xyz[2, 3]])
     torch.testing.assert_close(found[2, 3], last(functional.relu(first(seen))))
-    assert reached(found, encoder=encoder, places=places) == {"encoder", "places"}
+    assert reached(found, encoder=encoder, queries=places) == {"encoder", "queries"}

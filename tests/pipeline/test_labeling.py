@@ -11,7 +11,7 @@ import pytest
 from synthetic import assert_same, make_episode, with_quality
 from synthetic_clip import BOARD_M, CAMERA, WALL_M, film, record, truth
 
-from flowlab.engines.local import UnitResult
+from flowlab.engines.base import UnitResult
 from flowlab.errors import DataError, UsageError
 from flowlab.pipeline.labeling import estimate_cost, find_jobs, inspect_recording, label_recordings
 from flowlab.pipeline.recipe import Recipe, load_recipe

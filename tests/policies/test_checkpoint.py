@@ -18,25 +18,27 @@ from synthetic import SETTINGS, call_cli, make_dataset, make_episode
 from trained_runs import (
     SMALL,
     header_of,
-    kept_by,
     leftovers,
     make_recorded,
     make_rolls,
     make_run,
     options,
     policy_of,
+    saved_by,
+    small_settings,
     train,
     weights_of,
 )
 
 import flowlab
-from flowlab.data.batches import Batch, BatchBuilder, index_windows
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
+from flowlab.data.window_sampler import index_windows
 from flowlab.errors import DataError
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
-from flowlab.policies.settings import load_settings
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.shard import write_shard
 from flowlab.training import run as training_run
@@ -57,7 +59,7 @@ def run(rolls: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def prepare(data: Path, out: Path, policy: str, *changes: str) -> Trainer:
-    settings = load_settings("fast", policy, [*(word for word in SMALL if word != "--set"), *changes])
+    settings = small_settings(policy, *changes)
     return training_run.prepare_run(data, out, settings, training_run.ComputeSettings(device="cpu"))
 
 
@@ -65,7 +67,7 @@ def windows_of(data: Path, policy: PolicyNetwork) -> Batch:
     """Every window of a dataset."""
     buffer = load_buffer(open_training_source(data), data)
     settings = policy.spec.settings
-    every = index_windows(buffer, list(range(len(buffer.demos))), settings.n_action_steps)
+    every = index_windows(buffer, list(range(len(buffer.episodes))), settings.n_action_steps)
     return BatchBuilder(buffer, policy.spec.channels, settings, policy.spec.tasks).build(every)
 
 
@@ -226,7 +228,7 @@ def test_a_full_disk_costs_no_more_than_the_steps_since(
     trainer = prepare(rolls, tmp_path / "run", "fdp")
     steps = iter(range(1, 100))
     assert not training_run.run(trainer, lambda _: None, lambda: next(steps) == 9)
-    whole = kept_by(tmp_path / "run")
+    whole = saved_by(tmp_path / "run")
     with no_file_larger_than((run / too_large).stat().st_size - 1 if "safe" in too_large else 300):
         code, out, err = call_cli(capsys, "train", tmp_path / "run", "--resume", "--json")
     assert (code, out) == (3, "")
@@ -235,12 +237,12 @@ def test_a_full_disk_costs_no_more_than_the_steps_since(
         rf"room, then go on with 'flowlab train {tmp_path / 'run'} --resume'\n",
         err,
     )
-    assert {name: content for name, content in kept_by(tmp_path / "run").items() if name in whole} == whole
+    assert {name: content for name, content in saved_by(tmp_path / "run").items() if name in whole} == whole
     assert leftovers(tmp_path / "run") == []
     for file in (tmp_path / "run").rglob("*.safetensors"):
         header_of(file)
     train(capsys, tmp_path / "run", "--resume")
-    assert kept_by(tmp_path / "run") == kept_by(run)
+    assert saved_by(tmp_path / "run") == saved_by(run)
 
 
 @pytest.mark.parametrize("room", [0, 2000, 20_000])

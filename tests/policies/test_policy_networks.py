@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from builders import HAND, MLP, NORMALIZER, UNET, draws, generator, random_batch, tiny_settings, tiny_spec
+from builders import HAND, MLP, NORMALIZER, UNET, generator, random_batch, sampler, tiny_settings, tiny_spec
 from torch import Tensor
 
 from flowlab.data.batches import Batch
 from flowlab.data.channels import ChannelSpec
-from flowlab.policies.base import Losses, PolicyNetwork
+from flowlab.policies.base import Losses, make_policy
 
 HISTORY, HORIZON, M, A = 2, 8, 6, 4
 VARIANTS = [
@@ -29,16 +29,23 @@ EVERY_VARIANT = pytest.mark.parametrize(
 MOTIONS = pytest.mark.parametrize(("name", "layout"), [("mba", "channels"), ("fdp", "channels"), ("fdp", "per-query")])
 
 
-def make(name: str, *overrides: str, places: ChannelSpec | None = None, **changes: Any) -> tuple[PolicyNetwork, Batch]:
+def make(name: str, *overrides: str, places: ChannelSpec | None = None, **changes: Any) -> tuple[Any, Batch]:
     """A policy with random weights, and all windows of three demonstrations."""
     spec = tiny_spec(tiny_settings(name, *overrides), channels=places or ChannelSpec(), **changes)
     torch.manual_seed(0)
-    return PolicyNetwork(spec), random_batch(spec.settings, spec.channels)
+    return make_policy(spec), random_batch(spec.settings, spec.channels)
 
 
-def variant(name: str, network: str, layout: str, *overrides: str, **changes: Any) -> tuple[PolicyNetwork, Batch]:
-    networks = f"action={network}", f"motion.denoiser={network}", f"motion.flow_representation={layout}"
-    return make(name, *networks, *overrides, **changes)
+def variant(name: str, network: str, layout: str, *overrides: str, **changes: Any) -> tuple[Any, Batch]:
+    return make(
+        name, f"action={network}", *motion_settings(name, layout, f"motion.denoiser={network}"), *overrides, **changes
+    )
+
+
+def motion_settings(name: str, layout: str, *others: str) -> tuple[str, ...]:
+    """The settings of a motion that a policy has."""
+    representation = (f"motion.flow_representation={layout}",) if name == "fdp" else ()
+    return () if name == "dp3" else (*representation, *others)
 
 
 def scaled(values: Tensor, scale: Any) -> Tensor:
@@ -52,13 +59,13 @@ def scaled(values: Tensor, scale: Any) -> Tensor:
 @pytest.mark.parametrize("relative", [False, True])
 def test_every_weight_learns_from_every_batch(name: str, network: str, layout: str, relative: bool) -> None:
     policy, batch = variant(name, network, layout, f"encoder.relative={str(relative).lower()}", places=HAND)
-    losses = policy(batch, draws(), len(batch.observed))
-    if losses.motion is None:
+    losses = policy(batch, sampler(), len(batch.observed))
+    if "motion" not in losses.parts:
         assert name == "dp3"
-        assert losses.total is losses.action
+        assert losses.total is losses.parts["action"]
     else:
         weight = policy.spec.settings.motion.weight
-        torch.testing.assert_close(losses.total, losses.action + weight * losses.motion)
+        torch.testing.assert_close(losses.total, losses.parts["action"] + weight * losses.parts["motion"])
         assert weight != 1
     losses.total.backward()
     for key, p in policy.named_parameters():
@@ -72,21 +79,18 @@ def test_parts_of_a_batch_have_the_losses_and_gradients_of_the_whole(name: str, 
     """As processes share it: the mean over parts is the whole."""
     policy, batch = variant(name, network, layout, "encoder.relative=true", places=HAND)
     parts = [slice(k, k + 5) for k in range(0, 25, 5)]
-    whole: Losses = policy(batch, draws(), 25)
-    pieces = [policy(batch.part(p), draws(part=p), 25) for p in parts]
-    for loss in ("total", "action", "motion"):
-        if getattr(whole, loss) is not None:
-            mean = torch.stack([getattr(x, loss) for x in pieces]).mean()
-            torch.testing.assert_close(mean, getattr(whole, loss), rtol=1e-4, atol=1e-6)
+    whole: Losses = policy(batch, sampler(), 25)
+    pieces = [policy(batch.part(p), sampler(part=p), 25) for p in parts]
+    for loss, found in {"total": whole.total, **whole.parts}.items():
+        mean = torch.stack([x.total if loss == "total" else x.parts[loss] for x in pieces]).mean()
+        torch.testing.assert_close(mean, found, rtol=1e-4, atol=1e-6)
     weights = list(policy.parameters())
     mean = torch.autograd.grad(torch.stack([x.total for x in pieces]).mean(), weights)
     for mine, theirs in zip(mean, torch.autograd.grad(whole.total, weights), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-6)
 
 
-def answer(
-    policy: PolicyNetwork, monkeypatch: pytest.MonkeyPatch, action: Tensor, motion: Tensor | None = None
-) -> None:
+def answer(policy: Any, monkeypatch: pytest.MonkeyPatch, action: Tensor, motion: Tensor | None = None) -> None:
     """Have the networks predict these, in normalized units, whatever they see."""
 
     def always(answer: Tensor) -> Any:
@@ -121,7 +125,7 @@ def test_the_action_loss_is_the_weighted_distance_in_normalized_units(
     distance = truth.abs() if loss == "l1" else truth.square()
     assert (batch.action_weight == 0).any()
     wanted = (distance * batch.action_weight[..., None]).mean()
-    torch.testing.assert_close(policy(batch, draws(), 25).action, wanted)
+    torch.testing.assert_close(policy(batch, sampler(), 25).parts["action"], wanted)
 
 
 @pytest.mark.parametrize("layout", ["channels", "per-query"])
@@ -134,47 +138,47 @@ def test_the_flow_loss_is_the_weighted_distance_to_clipped_flow(layout: str, mon
     assert (truth.abs() > clip).any()
     answer(policy, monkeypatch, torch.zeros(25, HORIZON, A), laid_out(torch.zeros(25, HORIZON, M, 3), layout))
     wanted = (truth.clamp(-clip, clip).abs() * batch.flow_weight[..., None]).mean()
-    torch.testing.assert_close(policy(batch, draws(), 25).motion, wanted)
+    torch.testing.assert_close(policy(batch, sampler(), 25).parts["motion"], wanted)
 
 
 def test_each_window_has_so_many_draws_of_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean over five draws is that of five passes with one each."""
     policy, batch = make("dp3", "batch.draws=5")
-    d = draws()
+    d = sampler()
     step, noise = d.steps(20, 25, 5), d.normal(25, 5, HORIZON, A)
-    condition = policy.encoder(batch, policy._relative(batch.points, batch.state))
+    condition = policy.encoder(batch, policy.normalize_clouds(batch.points, batch.state))
     truth, total = policy.action_scale(batch.action), torch.zeros(())
     for k in range(5):
         noised = policy.diffusion.noised(truth, noise[:, k], step[:, k])
         found = policy.action.denoise(noised, policy.action.terms(condition, step[:, k, None]))
         total = total + ((found - truth).abs() * batch.action_weight[..., None]).mean() / 5
-    torch.testing.assert_close(policy(batch, draws(), 25).action, total)
+    torch.testing.assert_close(policy(batch, sampler(), 25).parts["action"], total)
 
 
 @MOTIONS
 def test_the_right_motion_has_no_loss_and_the_right_action_neither(
     name: str, layout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, batch = make(name, f"motion.flow_representation={layout}", "encoder.relative=true", places=HAND)
+    policy, batch = make(name, *motion_settings(name, layout), "encoder.relative=true", places=HAND)
     gripper = batch.state[batch.observed[:, -1]][:, :3]
     action = batch.action.clone()
     action[..., :3] -= gripper[:, None]
     if name == "fdp":
         motion = laid_out((batch.flow / 0.02).clamp(-3, 3), layout)
     else:
-        position = scaled(batch.object_pose[..., :3] - gripper[:, None], NORMALIZER.place)
+        position = scaled(batch.object_pose[..., :3] - gripper[:, None], NORMALIZER.position)
         motion = torch.cat([position, batch.object_pose[..., 3:]], -1)
     answer(policy, monkeypatch, scaled(action, NORMALIZER.action), motion)
-    losses = policy(batch, draws(), 25)
-    assert losses.action < 1e-6
-    assert losses.motion < 1e-6
+    losses = policy(batch, sampler(), 25)
+    assert losses.parts["action"] < 1e-6
+    assert losses.parts["motion"] < 1e-6
 
 
 @pytest.mark.parametrize("condition", ["clean", "one-step", "truth", "truth-noised", "auxiliary"])
 def test_losses_are_finite_whatever_the_action_is_conditioned_on(condition: str) -> None:
     for layout in ("channels", "per-query"):
         policy, batch = make("fdp", f"motion.condition='{condition}'", f"motion.flow_representation={layout}")
-        losses = policy(batch, draws(), 25)
+        losses = policy(batch, sampler(), 25)
         losses.total.backward()
         assert torch.isfinite(losses.total)
         assert policy.plan(batch, generator()).flow is not None
@@ -268,7 +272,7 @@ def test_plans_are_in_the_units_and_frame_of_the_dataset(
         torch.testing.assert_close(plan.flow, 0.02 * flow)
     if plan.object_pose is not None:
         torch.testing.assert_close(plan.object_pose[..., 3:], pose[..., 3:])
-        position = pose[..., :3] * 0.5 + torch.tensor(NORMALIZER.place.offset) + gripper[:, None]
+        position = pose[..., :3] * 0.5 + torch.tensor(NORMALIZER.position.offset) + gripper[:, None]
         torch.testing.assert_close(plan.object_pose[..., :3], position)
 
 
@@ -280,7 +284,7 @@ def test_plans_stay_within_the_limits(name: str, network: str, layout: str, monk
         policy,
         monkeypatch,
         torch.full((25, HORIZON, A), 7.0),
-        torch.full((25, *shape), -7.0) if policy.motion else None,
+        torch.full((25, *shape), -7.0) if hasattr(policy, "motion") else None,
     )
     plan = policy.plan(batch, generator())
     scale = NORMALIZER.action
@@ -293,7 +297,7 @@ def test_plans_stay_within_the_limits(name: str, network: str, layout: str, monk
 @pytest.mark.parametrize("layout", ["channels", "per-query"])
 def test_no_motion_is_zero_there_and_back(layout: str, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, batch = make("fdp", f"motion.flow_representation={layout}")
-    truth, _ = policy._true_motion(replace(batch, flow=torch.zeros_like(batch.flow)), None)
+    truth = policy.motion.pack(policy.motion_target(replace(batch, flow=torch.zeros_like(batch.flow)), None)[0])
     assert (truth == 0).all()
     answer(policy, monkeypatch, torch.zeros(25, HORIZON, A), torch.zeros_like(truth))
     assert (policy.plan(batch, generator()).flow == 0).all()
@@ -302,11 +306,11 @@ def test_no_motion_is_zero_there_and_back(layout: str, monkeypatch: pytest.Monke
 @MOTIONS
 def test_a_demonstration_is_given_back_as_it_was(name: str, layout: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the networks are taught, given back as their answer, is the plan that was demonstrated."""
-    policy, batch = make(name, f"motion.flow_representation={layout}", "encoder.relative=true", places=HAND)
-    gripper = policy._gripper(batch)
-    truth, _ = policy._true_motion(batch, gripper)
+    policy, batch = make(name, *motion_settings(name, layout), "encoder.relative=true", places=HAND)
+    gripper = policy.gripper(batch)
+    truth = policy.motion.pack(policy.motion_target(batch, gripper)[0])
     # Beyond the limits, a plan would be clipped.
-    action = policy._normal_action(batch.action, gripper)
+    action = policy.normalize_action(batch.action, gripper)
     assert policy.spec.channels.action_position is not None
     answer(policy, monkeypatch, action.clamp(-1, 1), truth.clamp(-2, 2))
     plan = policy.plan(batch, generator())
@@ -331,26 +335,26 @@ def shifted(batch: Batch, by: Tensor) -> Batch:
     changes = {}
     for name, places in {"state": [0, 3], "action": [0], "object_pose": [0], "points": [0], "queries": [0]}.items():
         values = getattr(batch, name).clone()
-        for k in places:
+        for k in places if values.shape[-1] else ():
             values[..., k : k + 3] += by
         changes[name] = values
     return replace(batch, **changes)
 
 
-def networks_see(policy: PolicyNetwork, batch: Batch) -> dict[str, Tensor]:
+def networks_see(policy: Any, batch: Batch) -> dict[str, Tensor]:
     """What enters the networks of a policy in training."""
     seen: dict[str, Tensor] = {}
     hooks = [
         policy.encoder.cloud.register_forward_pre_hook(lambda _, x: seen.update(cloud=x[0])),
         policy.encoder.state.register_forward_pre_hook(lambda _, x: seen.update(state=x[0])),
     ]
-    if policy.places is not None:
-        hooks.append(policy.places.register_forward_pre_hook(lambda _, x: seen.update(queries=x[1])))
-    gripper = policy._gripper(batch)
-    if policy.motion is not None:
-        seen["motion"] = policy._true_motion(batch, gripper)[0]
-    seen["action"] = policy._normal_action(batch.action, gripper)
-    policy(batch, draws(), 25)
+    if hasattr(policy, "query_encoder"):
+        hooks.append(policy.query_encoder.register_forward_pre_hook(lambda _, x: seen.update(queries=x[1])))
+    gripper = policy.gripper(batch)
+    if hasattr(policy, "motion"):
+        seen["motion"] = policy.motion.pack(policy.motion_target(batch, gripper)[0])
+    seen["action"] = policy.normalize_action(batch.action, gripper)
+    policy(batch, sampler(), 25)
     for hook in hooks:
         hook.remove()
     return seen
@@ -358,7 +362,7 @@ def networks_see(policy: PolicyNetwork, batch: Batch) -> dict[str, Tensor]:
 
 @MOTIONS
 def test_relative_to_the_gripper_a_scene_looks_the_same_elsewhere(name: str, layout: str) -> None:
-    policy, batch = make(name, f"motion.flow_representation={layout}", "encoder.relative=true", places=HAND)
+    policy, batch = make(name, *motion_settings(name, layout), "encoder.relative=true", places=HAND)
     here, there = (networks_see(policy, b) for b in (batch, shifted(batch, torch.tensor([0.3, -0.2, 0.1]))))
     assert here.keys() == there.keys()
     for key in here.keys() - {"state"}:
@@ -372,12 +376,12 @@ def test_relative_to_the_gripper_a_scene_looks_the_same_elsewhere(name: str, lay
 def test_in_the_world_a_scene_looks_different_elsewhere(name: str, layout: str) -> None:
     for changes in ({"places": HAND}, {}):
         relative = "false" if changes else "true"  # which needs a layout that has a gripper
-        policy, batch = make(name, f"motion.flow_representation={layout}", f"encoder.relative={relative}", **changes)
+        policy, batch = make(name, *motion_settings(name, layout), f"encoder.relative={relative}", **changes)
         assert not policy.relative
         by = torch.tensor([0.3, -0.2, 0.1])
         here, there = (networks_see(policy, b) for b in (batch, shifted(batch, by)))
         keys = ["cloud", *(["queries"] if name == "fdp" else [])]
-        torch.testing.assert_close(here["cloud"], scaled(batch.points, NORMALIZER.place))
+        torch.testing.assert_close(here["cloud"], scaled(batch.points, NORMALIZER.position))
         for key in keys:
             moved = (there[key] - here[key]) * 0.5
             torch.testing.assert_close(moved, by.expand_as(moved), rtol=1e-4, atol=1e-5)
@@ -387,11 +391,11 @@ def test_clouds_are_seen_from_the_gripper_of_their_frame_and_queries_from_that_o
     policy, batch = make("fdp", "encoder.relative=true", places=ChannelSpec(gripper=(3, 4, 5)))
     seen = networks_see(policy, batch)
     for f in range(len(batch.points)):
-        wanted = scaled(batch.points[f] - batch.state[f, 3:6], NORMALIZER.place)
+        wanted = scaled(batch.points[f] - batch.state[f, 3:6], NORMALIZER.position)
         torch.testing.assert_close(seen["cloud"][f], wanted)
     for w in range(25):
         now = batch.observed[w, HISTORY - 1]
-        wanted = scaled(batch.queries[w] - batch.state[now, 3:6], NORMALIZER.place)
+        wanted = scaled(batch.queries[w] - batch.state[now, 3:6], NORMALIZER.position)
         torch.testing.assert_close(seen["queries"][w], wanted)
     torch.testing.assert_close(seen["action"], scaled(batch.action, NORMALIZER.action), msg="no place is known there")
 
@@ -399,7 +403,7 @@ def test_clouds_are_seen_from_the_gripper_of_their_frame_and_queries_from_that_o
 @MOTIONS
 def test_plans_move_with_the_scene(name: str, layout: str) -> None:
     """With a policy that does not look at the absolute state, nothing but the scene's place is different."""
-    policy, batch = make(name, f"motion.flow_representation={layout}", "encoder.relative=true", places=HAND)
+    policy, batch = make(name, *motion_settings(name, layout), "encoder.relative=true", places=HAND)
     with torch.no_grad():
         policy.encoder.state[-1].weight.zero_()
     by = torch.tensor([0.3, -0.2, 0.1])
@@ -419,7 +423,7 @@ def test_plans_move_with_the_scene(name: str, layout: str) -> None:
 
 def test_every_frame_of_the_history_matters_in_its_order() -> None:
     policy, batch = make("dp3")
-    points = policy._relative(batch.points, batch.state)
+    points = policy.normalize_clouds(batch.points, batch.state)
     whole = policy.encoder(batch, points)
     assert whole.shape == (25, policy.encoder.features) == (25, HISTORY * (8 + 8) + 32)
     swapped = policy.encoder(replace(batch, observed=batch.observed.flip(1)), points)
@@ -436,7 +440,7 @@ def test_a_frame_that_windows_share_counts_as_if_each_had_its_own() -> None:
     own = torch.arange(batch.observed.numel()).view_as(batch.observed)
     frame = batch.observed.flatten()
     unshared = replace(batch, points=batch.points[frame], state=batch.state[frame], observed=own)
-    torch.testing.assert_close(policy(unshared, draws(), 25).total, policy(batch, draws(), 25).total)
+    torch.testing.assert_close(policy(unshared, sampler(), 25).total, policy(batch, sampler(), 25).total)
 
 
 @EVERY_VARIANT
@@ -446,7 +450,7 @@ def test_tasks_are_told_apart_where_there_are_several(name: str, network: str, l
     plan = policy.plan(batch, generator())
     other = policy.plan(replace(batch, task=1 - batch.task), generator())
     assert (plan.action - other.action).abs().amax((1, 2)).min() > 1e-5
-    alone = PolicyNetwork(tiny_spec(policy.spec.settings, tasks=("roll",)))
+    alone = make_policy(tiny_spec(policy.spec.settings, tasks=("roll",)))
     assert alone.encoder.task is None
     assert alone.encoder.features == policy.encoder.features - 32
     same, swapped = (alone.plan(b, generator()).action for b in (batch, replace(batch, task=1 - batch.task)))
@@ -458,7 +462,7 @@ def test_a_robot_without_a_state_is_seen_by_its_points_alone() -> None:
     normalizer = NORMALIZER.model_copy(update={"state": scale})
     policy, batch = make("dp3", state_width=0, normalizer=normalizer)
     blind = replace(batch, state=batch.state[:, :0])
-    policy(blind, draws(), 25).total.backward()
+    policy(blind, sampler(), 25).total.backward()
     assert policy.encoder.features == HISTORY * 8 + 32
     assert policy.plan(blind, generator()).action.shape == (25, HORIZON, A)
 
@@ -468,8 +472,8 @@ def test_the_action_knows_the_predicted_motion_unless_it_is_auxiliary(
     name: str, layout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for condition, told in (("clean", True), ("auxiliary", False)):
-        policy, batch = make(name, f"motion.flow_representation={layout}", f"motion.condition={condition}")
-        shape = policy._true_motion(batch, None)[0].shape
+        policy, batch = make(name, *motion_settings(name, layout), f"motion.condition={condition}")
+        shape = policy.motion.pack(policy.motion_target(batch, None)[0]).shape
         actions = []
         for value in (-0.5, 0.5):
             monkeypatch.setattr(policy.motion, "denoise", lambda *_, v=torch.full(shape, value): v)

@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from flowlab.config import Settings
+from flowlab.data.settings import TrainSettings
 from flowlab.errors import UsageError
-from flowlab.policies.settings import TrainSettings, load_settings
+from flowlab.policies.settings import load_settings
 
 PROFILES = Path(__file__).parents[2] / "pipelines/train"
 POLICIES = ["fdp", "dp3", "mba"]

@@ -8,11 +8,13 @@ import pytest
 import torch
 from builders import every_window, random_buffer, tiny_settings, tiny_spec
 
-from flowlab.data.batches import Batch, BatchBuilder, ObservationBatch, WindowIndex
+from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
+from flowlab.data.settings import TrainSettings
+from flowlab.data.window_sampler import WindowIndex
 from flowlab.policies.base import ActionPlan, Generators, PolicyNetwork
-from flowlab.policies.settings import TrainSettings
 from flowlab.training.validation import validate
 
 NOW, HORIZON, EXECUTED, LENGTH = 1, 8, 4, 30
@@ -231,7 +233,7 @@ def test_of_many_windows_some_are_looked_at_evenly_spaced() -> None:
 def test_windows_are_weighed_alike_however_they_are_portioned() -> None:
     """Means are over all that counts, not over portions."""
     buffer = rolling(3)
-    demos = tuple(EpisodeSlice("roll", d.seed, d.start, d.stop) for d in buffer.demos)
+    demos = tuple(EpisodeSlice("roll", d.seed, d.start, d.stop) for d in buffer.episodes)
     policy = oracle(tiny_settings("fdp"), flow_off=(0.001, 0.0, 0.0))
     whole = errors(replace(buffer, demos=demos), policy)
     windows = every_window(buffer, policy.spec.settings)

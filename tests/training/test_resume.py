@@ -19,12 +19,13 @@ from synthetic import call_cli, files_below, make_dataset, make_episode
 from trained_runs import (
     SMALL,
     header_of,
-    kept_by,
     leftovers,
     lines_of,
     make_rolls,
     make_run,
     options,
+    saved_by,
+    small_settings,
     train,
     weights_of,
     without_times,
@@ -95,7 +96,7 @@ def interrupt(run: Path, number: signal.Signals, command: list[str | Path], wait
 
 def check_same(resumed: Path, unbroken: Path) -> None:
     """All weights to the last bit, and all that was measured."""
-    assert kept_by(resumed) == kept_by(unbroken)
+    assert saved_by(resumed) == saved_by(unbroken)
     assert without_times(lines_of(resumed)) == without_times(lines_of(unbroken))
     assert (resumed / "policy.json").read_bytes() == (unbroken / "policy.json").read_bytes()
     assert leftovers(resumed) == []
@@ -129,14 +130,14 @@ def stop_after(steps: int) -> Callable[[], bool]:
 
 
 VARIANTS = {
-    "dp3": ("dp3", "fast", ()),
-    "mba": ("mba", "fast", ()),
+    "dp3": ("dp3", SMALL[1], ()),
+    "mba": ("mba", SMALL[1], ()),
     "fdp as in the paper": (
         "fdp", "paper",
         ("encoder.points=64", "motion.points=8", "action.widths=[8,16]", "motion.denoiser.widths=[8,16]",
          "batch.windows=16", "encoder.widths=[16,16]"),
     ),
-    "fdp, one step": ("fdp", "fast", ("motion.condition=one-step", "encoder.subset=32", "motion.subset=4")),
+    "fdp, one step": ("fdp", SMALL[1], ("motion.condition=one-step", "encoder.subset=32", "motion.subset=4")),
 }  # fmt: skip
 
 
@@ -144,8 +145,7 @@ VARIANTS = {
 def test_wherever_a_run_stops_nothing_is_lost(variant: str, rolls: Path, tmp_path: Path) -> None:
     """Of each kind of policy: at the first step, and off every line and checkpoint. Resumed twice in between."""
     policy, profile, changes = VARIANTS[variant]
-    small = [word for word in SMALL if word != "--set"] if profile == "fast" else []
-    settings = load_settings(profile, policy, [*small, *changes, "run.minutes=null", "run.steps=30"])
+    settings = load_settings(profile, policy, [*changes, "run.minutes=null", "run.steps=30"])
     machine = training_run.ComputeSettings(device="cpu")
     for name in ("unbroken", "broken"):
         trainer = training_run.prepare_run(rolls, tmp_path / name, settings, machine)
@@ -160,7 +160,7 @@ def test_wherever_a_run_stops_nothing_is_lost(variant: str, rolls: Path, tmp_pat
 
 def test_a_run_that_dies_at_once_can_be_resumed(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     """Before its first step, say while another program is asked to log."""
-    settings = load_settings("fast", "dp3", [word for word in SMALL if word != "--set"])
+    settings = small_settings("dp3")
     training_run.prepare_run(rolls, tmp_path / "died", settings, training_run.ComputeSettings(device="cpu"))
     train(capsys, tmp_path / "died", "--resume")
     train(capsys, rolls, "--policy", "dp3", "--out", tmp_path / "whole", *SMALL, "--device", "cpu")
@@ -190,16 +190,16 @@ def test_ctrl_c_before_there_is_anything_to_draw(rolls: Path, tmp_path: Path, ca
 
 def test_a_finished_run_stays_as_it_is(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     train(capsys, rolls, "--policy", "dp3", "--out", tmp_path / "run", *SMALL)
-    before, lines = kept_by(tmp_path / "run"), lines_of(tmp_path / "run")
+    before, lines = saved_by(tmp_path / "run"), lines_of(tmp_path / "run")
     assert "trained for 20 steps" in train(capsys, tmp_path / "run", "--resume")
-    assert (kept_by(tmp_path / "run"), lines_of(tmp_path / "run")) == (before, lines)
+    assert (saved_by(tmp_path / "run"), lines_of(tmp_path / "run")) == (before, lines)
 
 
 def test_the_same_seed_gives_the_same_weights(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     short = (rolls, "--policy", "fdp", *SMALL, *options("run.steps=8", "run.checkpoints=2"))
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         train(capsys, *short, "--out", tmp_path / name, "--seed", str(seed))
-    assert kept_by(tmp_path / "a") == kept_by(tmp_path / "b")
+    assert saved_by(tmp_path / "a") == saved_by(tmp_path / "b")
     assert without_times(lines_of(tmp_path / "a")) == without_times(lines_of(tmp_path / "b"))
     for name, seed in (("d", 5), ("e", 6)):  # what is drawn on the way differs too
         train(capsys, *short, "--out", tmp_path / name, "--seed", str(seed), "--from", tmp_path / "a")
@@ -212,7 +212,7 @@ def test_the_same_seed_gives_the_same_weights(rolls: Path, tmp_path: Path, capsy
 
 def stopped(rolls: Path, run: Path) -> Path:
     """A run that was stopped at step 9 of 20."""
-    settings = load_settings("fast", "dp3", [word for word in SMALL if word != "--set"])
+    settings = small_settings("dp3")
     trainer = training_run.prepare_run(rolls, run, settings, training_run.ComputeSettings(device="cpu"))
     assert not training_run.run(trainer, lambda _: None, stop_after(9))
     return run

@@ -39,14 +39,15 @@ class ROSReader:
     """Reads one RGB-D camera, and the robot, from a recording of ROS."""
 
     name = "ros"
-    looks_for = "a ROS .bag, .mcap or .db3 file (the RealSense SDK's .db3 too), or the folder of a ROS 2 recording"
-    general = False
+    expects = "a ROS .bag, .mcap or .db3 file (the RealSense SDK's .db3 too), or the folder of a ROS 2 recording"
+    fallback = False
 
     def probe(self, path: Path) -> bool:
         """Whether it is a recording of ROS, and none of the RealSense SDK."""
         if path.is_dir():
             return (path / "metadata.yaml").is_file() and any(f.suffix in (".mcap", ".db3") for f in path.iterdir())
-        return path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
+        known = path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
+        return known and path.is_file()
 
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams. Topics are found by type, encoding and name, or as ``topics`` says."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, UInt8
 
 from flowlab.records import Clip
-from flowlab.tracking.trackers.rigid_bodies import _kernels
+from flowlab.tracking.trackers.rigid_bodies import _surfaces
 
 WIDTH = 320
 """Pictures are shrunk by a whole factor to about this width [px]: the fit gains nothing from more."""
@@ -33,7 +33,7 @@ class ClipFeatures:
     normal: Int8[np.ndarray, "T h w 3"]
     """Of the smooth surface, in 1/127; 0 where not known."""
     feature: UInt8[np.ndarray, "T h w 4"]
-    """Locally normalized lightness, and CIE lightness, a and b; see :mod:`._kernels` for what a count costs."""
+    """Locally normalized lightness, and CIE lightness, a and b; see :mod:`._costs` for what a count costs."""
     flow: Float32[np.ndarray, "T h w 2"]
     """Where a pixel of the frame before goes in this one [px]; 0 for the first."""
 
@@ -54,17 +54,17 @@ class ClipFeatures:
         z = np.maximum(xyz_cam[..., 2:], 1e-6)
         return xyz_cam[..., :2] / z * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
 
-    def to_own(self, uv: np.ndarray) -> np.ndarray:
+    def from_clip_pixels(self, uv: np.ndarray) -> np.ndarray:
         """Pixels of the clip as pixels of these pictures."""
         return (uv - self.offset) / self.factor
 
     @property
-    def size_of_clip(self) -> int:
+    def clip_size(self) -> int:
         """The longer side [px] of the clip's pictures, but for what shrinking cut off."""
         return self.factor * max(self.depth.shape[1:])
 
-    def to_clip(self, uv: np.ndarray) -> np.ndarray:
-        """The inverse of :meth:`to_own`."""
+    def to_clip_pixels(self, uv: np.ndarray) -> np.ndarray:
+        """The inverse of :meth:`from_clip_pixels`."""
         return uv * self.factor + self.offset
 
 
@@ -81,8 +81,8 @@ def extract_features(clip: Clip, max_depth: float) -> ClipFeatures:
     normal = np.empty((*depth.shape, 3), np.int8)
     feature = np.empty((*depth.shape, 4), np.uint8)
     for k in range(len(depth)):
-        smooth[k] = _kernels.smooth_depth(depth[k])
-        normal[k] = _kernels.surface_normals(smooth[k], K)
+        smooth[k] = _surfaces.smooth_depth(depth[k])
+        normal[k] = _surfaces.surface_normals(smooth[k], K)
         feature[k] = _feature(clip.rgb[k], factor, offset)
     flow = np.zeros((*depth.shape, 2), np.float32)
     dense: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)

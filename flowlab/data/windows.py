@@ -1,0 +1,217 @@
+"""Windows of a dataset for anybody's own training loop: a map-style :class:`torch.utils.data.Dataset`."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from flowlab.data.cache import cached_part, open_part
+from flowlab.data.replay_buffer import ARRAYS, arrays_of, pictures_of
+from flowlab.data.source import TrainingSource, open_training_source, source_of
+from flowlab.data.window_stats import describe_rows
+from flowlab.errors import DataError, UsageError, unknown_name
+from flowlab.storage.dataset import Dataset
+
+PICTURES = ("rgb", "depth")
+_PER_EPISODE = ("queries", "query_role", "query_count")
+
+
+class Windows(torch.utils.data.Dataset[dict[str, Any]]):
+    """Every frame of a dataset, each with the rows around it that are asked for.
+
+    Item i is a dictionary:
+
+    - ``KEY``: a tensor (T, ...) with a row for each of the T offsets of that key, in the dataset's units. Arrays keep
+      their type (float32 but for ``visible``, ``success``: bool, ``time``: float64, ``point_count``: int32); ``rgb`` is
+      (T, 3, height, width), float32 from 0 to 1, and ``depth`` (T, 1, height, width), z-depth [m], 0 where there is no
+      reading. ``flow`` (T, M, 3) is how far every query point moves until the next row [m], 0 in the last.
+    - ``KEY_is_pad``: (T,) bool, whether that row lies outside of the episode; then the first or last row is repeated.
+    - ``task``: name of the task; ``episode_index`` and ``frame_index``: where the frame is, both from 0.
+
+    It can be pickled, and every process maps the files anew, so that it works with the workers of a
+    :class:`torch.utils.data.DataLoader`.
+
+        windows = Windows("data/push", {"point_cloud": [-1, 0], "state": [-1, 0], "action": range(16)})
+        loader = torch.utils.data.DataLoader(windows, batch_size=64, shuffle=True, num_workers=2)
+
+    Args:
+        data: A dataset, or a store in DP3's layout, opened or by its path.
+        offsets: For every key that is wanted, its rows relative to the frame: ``[-1, 0]`` is the one before, and its
+            own.
+        delta_timestamps: The same in seconds; give either. The rows must be evenly spaced in time.
+        episodes: Which episodes, by their position in order of task and seed; None is all of them.
+        tolerance_s: How far a time may be from that of a row [s].
+        cache: Folder for the decoded arrays where the dataset's own cannot be written.
+
+    Raises:
+        UsageError: A key, an offset or an episode does not exist, or a time is that of no row.
+        DataError: The dataset cannot be read, or its rows are not evenly spaced in time where that matters.
+    """
+
+    def __init__(
+        self,
+        data: Dataset | Path | str,
+        offsets: Mapping[str, Sequence[int]] | None = None,
+        *,
+        delta_timestamps: Mapping[str, Sequence[float]] | None = None,
+        episodes: Sequence[int] | None = None,
+        tolerance_s: float = 1e-4,
+        cache: Path | str | None = None,
+    ) -> None:
+        source = source_of(data) if isinstance(data, Dataset) else open_training_source(Path(data))
+        fallback = source.path if cache is None else Path(cache)
+        self.path = source.path
+        self._statistics = source.statistics["arrays"]
+        self._folders = [cached_part(source, fallback, ARRAYS, arrays_of)]
+        every, arrays = open_part(self._folders[0])
+        asked = _one_of(offsets, delta_timestamps)
+        self._find_pictures(source, fallback, asked)
+        self.keys = self._known(arrays)
+        """Names of everything that can be asked for."""
+        for key in asked:
+            if key not in self.keys:
+                raise UsageError(f"{self.path}: {unknown_name('array', str(key), self.keys)}")
+        self.episodes: tuple[int, ...] = _chosen(episodes, len(every), self.path)
+        """Positions of the episodes in the dataset, in order of task and seed."""
+        self._episodes = [every[k] for k in self.episodes]
+        lengths = [e["stop"] - e["start"] for e in self._episodes]
+        self.episode_ends: Int[np.ndarray, E] = np.cumsum(lengths)
+        """The index after the last of each episode."""
+        self.offsets: dict[str, np.ndarray] = {
+            key: _rows(values) if offsets is not None else self._times_to_rows(key, values, source, tolerance_s)
+            for key, values in asked.items()
+        }
+        """Rows of every key, relative to the frame."""
+
+    def __len__(self) -> int:
+        return int(self.episode_ends[-1])
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{self.path}: there are {len(self)} windows, and no window {index}")
+        index = index % len(self)
+        k = int(np.searchsorted(self.episode_ends, index, side="right"))
+        episode = self._episodes[k]
+        frame = index - (int(self.episode_ends[k - 1]) if k else 0)
+        item: dict[str, Any] = {"task": episode["task"], "episode_index": self.episodes[k], "frame_index": frame}
+        for key, offsets in self.offsets.items():
+            wanted = episode["start"] + frame + offsets
+            rows = np.clip(wanted, episode["start"], episode["stop"] - 1)
+            item[key] = self._read(key, rows, episode["stop"] - 1)
+            item[f"{key}_is_pad"] = torch.from_numpy(wanted != rows)
+        return item
+
+    def __repr__(self) -> str:
+        about = ", ".join(f"{key} {offsets.tolist()}" for key, offsets in self.offsets.items())
+        return f"Windows({str(self.path)!r}: {len(self)} windows of {len(self.episodes)} episodes; {about})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is mapped into memory, which every process maps for itself."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_arrays", "stats")}
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Names of the tasks, sorted."""
+        return tuple(sorted({e["task"] for e in self._episodes}))
+
+    @cached_property
+    def stats(self) -> dict[str, dict[str, Tensor]]:
+        """``min``, ``max``, ``mean`` and ``std`` of every key that is asked for and is no yes or no, over all episodes
+        of the dataset: per channel, so of shape (3,) for clouds, and of pictures as they are handed out."""
+        found = {}
+        for key in self.offsets:
+            if key in self._statistics:
+                about = self._statistics[key]
+                found[key] = {n: torch.tensor(about[n]).float() for n in ("min", "max", "mean", "std")}
+            elif self._arrays[key].dtype != bool:
+                found[key] = describe_rows(key, self._arrays[key])
+        return found
+
+    @cached_property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        return {name: array for folder in self._folders for name, array in open_part(folder)[1].items()}
+
+    def _read(self, key: str, rows: Int[np.ndarray, "T"], last: int) -> Tensor:
+        if key == "flow":
+            tracks = self._arrays["tracks"]
+            return torch.from_numpy(tracks[np.minimum(rows + 1, last)] - tracks[rows])
+        values = torch.from_numpy(np.array(self._arrays[key][rows]))
+        if key == "rgb":
+            return values.permute(0, 3, 1, 2).float() / 255
+        return values[:, None] if key == "depth" else values
+
+    def _find_pictures(self, source: TrainingSource, fallback: Path, asked: Mapping[str, Any]) -> None:
+        """Decode the pictures that are asked for."""
+        for name in PICTURES:
+            if name in asked:
+                self._folders.append(cached_part(source, fallback, name, partial(pictures_of, name=name)))
+
+    def _known(self, arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+        """What can be asked for: arrays that are not empty, flow where there are tracks, and pictures that were
+        found."""
+        names = {n for n, a in arrays.items() if n not in _PER_EPISODE and 0 not in a.shape[1:]}
+        names |= {"flow"} if "tracks" in names else set()
+        for folder in self._folders[1:]:
+            names |= set(open_part(folder)[1])
+        return tuple(sorted(names))
+
+    def _times_to_rows(
+        self, key: str, times: Sequence[float], source: TrainingSource, tolerance_s: float
+    ) -> Int[np.ndarray, "T"]:
+        step = self._step_s(source, tolerance_s)
+        rows = np.round(np.asarray(times, float) / step).astype(int)
+        for time, row in zip(times, rows, strict=True):
+            if abs(time - row * step) > tolerance_s:
+                raise UsageError(
+                    f"{self.path}: delta_timestamps of '{key}': {time:g} s is that of no row; the rows are {step:g} s "
+                    f"apart, so the nearest is {row * step:g} s"
+                )
+        return rows
+
+    def _step_s(self, source: TrainingSource, tolerance_s: float) -> float:
+        """Time from row to row [s]."""
+        if source.provenance.kind == "imported":
+            raise DataError(f"{self.path}: does not tell how far its rows are apart in time; give offsets in rows")
+        time = self._arrays["time"]
+        steps = np.concatenate([np.diff(time[e["start"] : e["stop"]]) for e in self._episodes])
+        step = float(np.median(steps)) if len(steps) else 1.0
+        if len(steps) and np.abs(steps - step).max() > tolerance_s:
+            raise DataError(
+                f"{self.path}: its rows are not evenly spaced in time: {steps.min():g} to {steps.max():g} s apart, and "
+                f"tolerance_s is {tolerance_s:g}; give offsets in rows"
+            )
+        return step
+
+
+def _one_of(
+    offsets: Mapping[str, Sequence[int]] | None, delta_timestamps: Mapping[str, Sequence[float]] | None
+) -> Mapping[str, Sequence[Any]]:
+    if (offsets is None) == (delta_timestamps is None):
+        raise UsageError(
+            "Windows: give either offsets or delta_timestamps, as in {'state': [-1, 0], 'action': range(8)}"
+        )
+    asked = offsets if offsets is not None else delta_timestamps
+    assert asked is not None
+    return asked
+
+
+def _rows(offsets: Sequence[int]) -> Int[np.ndarray, "T"]:
+    rows = np.asarray(offsets)
+    if rows.ndim != 1 or not len(rows) or rows.dtype.kind not in "iu":
+        raise UsageError(f"Windows: offsets must be whole numbers of rows, as in [-1, 0]; found {offsets!r}")
+    return rows.astype(int)
+
+
+def _chosen(episodes: Sequence[int] | None, count: int, path: Path) -> tuple[int, ...]:
+    chosen = tuple(range(count)) if episodes is None else tuple(episodes)
+    for k in chosen:
+        if not 0 <= k < count:
+            raise UsageError(f"{path}: no episode {k}; there are {count}, counted from 0")
+    if not chosen:
+        raise UsageError(f"{path}: episodes is empty; leave it out for all {count} of them")
+    return chosen

@@ -1,0 +1,203 @@
+"""Train a policy: what ``flowlab train`` and ``flowlab.train`` both call."""
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flowlab.policies.checkpoint import writing_run
+from flowlab.policies.settings import load_settings
+from flowlab.training.loggers import check_loggers
+from flowlab.training.metrics import METRICS, last_metrics
+from flowlab.training.run import ComputeSettings, Precision, prepare_run, resume_run, run
+from flowlab.training.trainer import Trainer, TrainingProgress
+
+CURVE = "curve.png"
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedRun:
+    """A training run that has come to its end, or was stopped."""
+
+    folder: Path
+    policy: str
+    """Name of the policy."""
+    step: int
+    """Training steps done."""
+    steps: int
+    """Training steps that the run has in all."""
+    finished: bool
+    """Whether it came to its end; else it can be resumed."""
+    training: dict[str, float]
+    """The newest losses."""
+    validation: dict[str, float]
+    """The newest errors on held-out demonstrations, see :func:`~flowlab.training.validation.validate`."""
+
+    @property
+    def curve(self) -> Path:
+        """The figure of how losses and errors fell."""
+        return self.folder / CURVE
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        return {
+            "run": str(self.folder),
+            "policy": self.policy,
+            "step": self.step,
+            "steps": self.steps,
+            "finished": self.finished,
+            "training": self.training,
+            "validation": self.validation,
+        }
+
+
+def _ignore(_: object) -> None:
+    """Nobody wants to know."""
+
+
+def _never() -> bool:
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Who looks on while a run goes."""
+
+    on_start: Callable[[str], None] = _ignore
+    """Is told in words what was found and what will be done."""
+    on_progress: Callable[[TrainingProgress], None] = _ignore
+    """Is told how far the run is, every fifty steps."""
+    should_stop: Callable[[], bool] = _never
+    """Asked after every step whether to stop, as one that can be resumed."""
+
+
+def train(
+    data: Path | str,
+    out: Path | str,
+    *,
+    policy: str = "fdp",
+    profile: str = "fast",
+    minutes: float | None = None,
+    settings: Sequence[str] = (),
+    seed: int | None = None,
+    overfit: int | None = None,
+    began_from: Path | str | None = None,
+    device: str = "auto",
+    threads: int = 1,
+    precision: Precision = "auto",
+    logs: Sequence[str] = (),
+    watch: Watch = Watch(),
+) -> TrainedRun:
+    """Train a policy on a dataset.
+
+    Under ``torchrun`` every process calls this, and they share each batch.
+
+    Args:
+        data: A dataset, or a store in DP3's layout.
+        out: Folder of the run, which must not hold one yet.
+        policy: ``fdp``, ``dp3``, ``mba``, what an installed package offers, or ``module:Class``, whose module may lie
+            in the current folder.
+        profile: ``fast``, ``paper``, or a YAML file; see :func:`~flowlab.policies.settings.load_settings`.
+        minutes: How long, in CPU time of one thread, or on a GPU by the clock; None leaves it to the profile.
+        settings: Single changes, ``key.path=value``.
+        seed: Short for the setting ``run.seed``.
+        overfit: Train on so many demonstrations, the first ones, and validate on the same.
+        began_from: A run, or one of its checkpoints, that the first weights are taken from.
+        device: ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` is a GPU where there is one.
+        threads: CPU threads of each process.
+        precision: ``fp32`` or ``bf16``; ``auto`` is bf16 where the device has units for it.
+        logs: Where else metrics go: ``tensorboard``, ``wandb``, what an installed package offers, or ``module:Class``.
+        watch: Is told of the run as it goes, and may stop it.
+
+    Returns:
+        The run, of which ``folder`` is what :class:`flowlab.Policy` loads.
+
+    Raises:
+        UsageError: A name, a setting or an option is wrong, or ``out`` holds a run already.
+        DataError: The dataset cannot be read, or lacks what the policy is trained on.
+        DivergedError: The loss is no longer a number.
+    """
+    here = Path.cwd()
+    changes = [f"run.minutes={minutes}", "run.steps=null"] if minutes else []
+    changes += [f"run.seed={seed}"] if seed is not None else []
+    chosen = load_settings(profile, policy, [*settings, *changes], here)
+    check_loggers(tuple(logs), here)
+    compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
+    began = None if began_from is None else Path(began_from)
+    trainer = prepare_run(Path(data), Path(out), chosen, compute, overfit=overfit, began_from=began)
+    return _run(trainer, watch)
+
+
+def resume(
+    folder: Path | str,
+    *,
+    device: str | None = None,
+    threads: int | None = None,
+    precision: Precision | None = None,
+    logs: Sequence[str] | None = None,
+    watch: Watch = Watch(),
+) -> TrainedRun:
+    """Go on with a run that ended early, as if it had never stopped.
+
+    Arguments and errors are those of :func:`train`; what is None is as the run began.
+    """
+    if logs is not None:
+        check_loggers(tuple(logs), Path.cwd())
+    trainer = resume_run(Path(folder), device=device, threads=threads, precision=precision, logs=logs)
+    return _run(trainer, watch)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Tells, by what it yields, whether Ctrl-C or a termination asked to stop; a second one stops at once."""
+    asked: list[int] = []
+
+    def ask(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run(trainer: Trainer, watch: Watch) -> TrainedRun:
+    first, metrics = trainer.processes.is_first, trainer.folder / METRICS
+    if first:
+        for text in _describe(trainer):
+            watch.on_start(text)
+    finished = run(trainer, watch.on_progress, watch.should_stop)
+    found = TrainedRun(
+        folder=trainer.folder,
+        policy=trainer.settings.policy,
+        step=trainer.step,
+        steps=trainer.run.steps,
+        finished=finished,
+        training=last_metrics(metrics, "train") if first else {},
+        validation=last_metrics(metrics, "validation") if first else {},
+    )
+    if found.training or found.validation:
+        from flowlab.viz.training_figure import draw_training
+
+        with writing_run(trainer.folder):
+            draw_training(metrics, found.curve)
+    return found
+
+
+def _describe(trainer: Trainer) -> Iterator[str]:
+    """What was found and what will be done, before it takes long."""
+    spec, planned = trainer.policy.spec, trainer.run
+    millions = sum(p.numel() for p in trainer.policy.parameters()) / 1e6
+    yield (
+        f"{spec.settings.policy}, {millions:.1f} M weights, {planned.steps - trainer.step:,} steps on "
+        f"{len(planned.train)} demonstrations of {', '.join(spec.tasks)}; {len(planned.held_out)} held out; "
+        f"{trainer.processes.description}"
+    )
+    if spec.settings.relative_to_gripper and spec.channels.gripper is None:
+        yield "points are given in the world frame: the data do not tell where in it the gripper is"

@@ -1,0 +1,215 @@
+"""Windows for anybody's own training hold what the episodes say, whoever reads them."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import make_dataset, make_episode, with_quality
+from torch.utils.data import DataLoader
+
+import flowlab
+from flowlab.data import Windows
+from flowlab.errors import DataError, FlowlabError, UsageError
+from flowlab.records import Episode
+from flowlab.storage.dataset import Dataset
+from flowlab.storage.exporters.dp3 import export_dp3
+
+LENGTHS = (9, 14, 6)
+
+
+def with_pictures(e: Episode) -> Episode:
+    rng = np.random.default_rng(e.seed)
+    depth = rng.uniform(0.5, 1, (len(e), 6, 8)).astype(np.float32)
+    depth[:, 0] = 0
+    return replace(e, rgb=rng.integers(0, 256, (len(e), 6, 8, 3), np.uint8), depth=depth)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "d"
+    made = [make_episode(k, task="roll", steps=n) for k, n in enumerate(LENGTHS)] + [make_episode(7, task="push")]
+    made = [with_pictures(with_quality(e)) for e in made]
+    make_dataset(folder, [[made[1], made[0]], [made[2]], [made[3]]])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def episodes(data: Path) -> list[Episode]:
+    dataset = Dataset(data)
+    return [dataset.episode(k) for k in range(len(dataset))]
+
+
+def row_of(e: Episode, key: str, t: int) -> np.ndarray:
+    """Read from the episode itself."""
+    t = min(max(t, 0), len(e) - 1)
+    assert e.tracks.quality is not None
+    if key == "flow":
+        return e.tracks.xyz_world[t + 1] - e.tracks.xyz_world[t] if t + 1 < len(e) else 0 * e.tracks.xyz_world[t]
+    if key == "rgb":
+        assert e.rgb is not None
+        return np.moveaxis(e.rgb[t], -1, 0) / np.float32(255)
+    if key == "depth":
+        assert e.depth is not None
+        return e.depth[t][None]
+    arrays = {"tracks": e.tracks.xyz_world, "visible": e.tracks.visible, "sigma": e.tracks.quality.sigma,
+              "time": e.time_s}  # fmt: skip
+    values = arrays[key] if key in arrays else getattr(e, key)
+    return values[t]
+
+
+KEYS = ("point_cloud", "point_count", "state", "action", "success", "time", "tracks", "visible", "sigma", "flow",
+        "object_pose", "rgb", "depth")  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    offsets=st.dictionaries(st.sampled_from(KEYS), st.lists(st.integers(-20, 20), min_size=1, max_size=5), min_size=1),
+    chosen=st.lists(st.integers(0, 3), min_size=1, max_size=4, unique=True),
+    where=st.floats(0, 1, exclude_max=True),
+)
+def test_a_window_is_what_its_episode_says(
+    data: Path, episodes: list[Episode], offsets: dict[str, list[int]], chosen: list[int], where: float
+) -> None:
+    windows = Windows(data, offsets, episodes=chosen)
+    assert len(windows) == sum(len(episodes[k]) for k in chosen)
+    index = int(where * len(windows))
+    item = windows[index]
+    e, frame = episodes[item["episode_index"]], item["frame_index"]
+    before = chosen[: chosen.index(item["episode_index"])]
+    assert sum(len(episodes[k]) for k in before) + frame == index
+    assert item["task"] == e.task
+    assert set(item) == {"task", "episode_index", "frame_index"} | {n for k in offsets for n in (k, f"{k}_is_pad")}
+    for key, rows in offsets.items():
+        wanted = np.stack([row_of(e, key, frame + r) for r in rows])
+        assert item[key].dtype == torch.from_numpy(wanted).dtype, key
+        np.testing.assert_array_equal(item[key].numpy(), wanted, err_msg=key)
+        assert item[f"{key}_is_pad"].tolist() == [not 0 <= frame + r < len(e) for r in rows]
+
+
+def test_windows_are_numbered_from_either_end(data: Path) -> None:
+    windows = Windows(data, {"action": [0]})
+    assert torch.equal(windows[-1]["action"], windows[len(windows) - 1]["action"])
+    assert windows.episode_ends.tolist() == np.cumsum([len(e) for e in map(Dataset(data).episode, range(4))]).tolist()
+    for outside in (len(windows), -len(windows) - 1):
+        with pytest.raises(IndexError, match=f"no window {outside}"):
+            windows[outside]
+
+
+def test_a_dataset_that_is_open_will_do(data: Path) -> None:
+    assert torch.equal(
+        Windows(Dataset(data), {"state": [0]})[3]["state"], Windows(str(data), {"state": [0]})[3]["state"]
+    )
+    assert flowlab.data.Windows is Windows
+    assert "47" not in repr(Windows(data, {"state": [0]})) or len(repr(Windows(data, {"state": [0]}))) < 300
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_loaders_with_workers_see_every_window_once(data: Path, episodes: list[Episode], workers: int) -> None:
+    windows = Windows(data, {"point_cloud": [-1, 0], "action": range(8), "rgb": [0]})
+    loader = DataLoader(
+        windows, batch_size=5, shuffle=True, num_workers=workers, multiprocessing_context="spawn" if workers else None
+    )
+    seen = []
+    for batch in loader:
+        assert batch["point_cloud"].shape[1:] == (2, *episodes[0].point_cloud.shape[1:])
+        assert batch["action"].shape[1:] == (8, episodes[0].action.shape[1])
+        assert batch["rgb"].shape[1:] == (1, 3, 6, 8)
+        seen += list(zip(batch["episode_index"].tolist(), batch["frame_index"].tolist(), strict=True))
+        for k, (e, t) in enumerate(seen[-len(batch["action"]) :]):
+            np.testing.assert_array_equal(batch["action"][k, 0], episodes[e].action[t])
+    assert sorted(seen) == [(e, t) for e in range(4) for t in range(len(episodes[e]))]
+
+
+def test_a_pickle_holds_no_arrays(data: Path) -> None:
+    windows = Windows(data, {"point_cloud": [0], "rgb": [0]})
+    before = windows[5]
+    assert windows.stats
+    content = pickle.dumps(windows)
+    assert len(content) < 20_000
+    after = pickle.loads(content)[5]
+    assert torch.equal(after["rgb"], before["rgb"])
+
+
+def test_times_are_rows_where_they_are_multiples_of_a_step(data: Path, episodes: list[Episode]) -> None:
+    step = float(episodes[0].time_s[1])
+    by_time = Windows(data, delta_timestamps={"action": [-step, 0, 2 * step + 5e-5], "state": [0.0]})
+    by_row = Windows(data, {"action": [-1, 0, 2], "state": [0]})
+    for name, value in by_row[4].items():
+        assert torch.equal(by_time[4][name], value) if isinstance(value, torch.Tensor) else by_time[4][name] == value
+    with pytest.raises(UsageError, match=rf"'action': {step / 2:g} s is that of no row; the rows are {step:g} s apart"):
+        Windows(data, delta_timestamps={"action": [step / 2]})
+
+
+def test_rows_that_are_not_evenly_spaced_have_no_times(tmp_path: Path) -> None:
+    e = make_episode(0)
+    time = e.time_s.copy()
+    time[3:] += 0.01
+    make_dataset(tmp_path / "d", [[replace(e, time_s=time)]])
+    with pytest.raises(
+        DataError, match=r"d: its rows are not evenly spaced in time: .* s apart, and tolerance_s is 0.0001"
+    ):
+        Windows(tmp_path / "d", delta_timestamps={"action": [0.0]})
+    Windows(tmp_path / "d", delta_timestamps={"action": [0.0]}, tolerance_s=0.02)
+
+
+def test_a_store_of_dp3_does_not_tell_times(data: Path, tmp_path: Path, episodes: list[Episode]) -> None:
+    export_dp3(Dataset(data), tmp_path / "s.zarr", "roll")
+    windows = Windows(tmp_path / "s.zarr", {"point_cloud": [0], "action": [0, 1]})
+    assert len(windows) == sum(LENGTHS)
+    assert "tracks" not in windows.keys
+    assert "flow" not in windows.keys
+    with pytest.raises(DataError, match="does not tell how far its rows are apart in time; give offsets in rows"):
+        Windows(tmp_path / "s.zarr", delta_timestamps={"action": [0.0]})
+
+
+def test_stats_are_those_of_the_numbers_handed_out(data: Path) -> None:
+    windows = Windows(data, {key: [0] for key in KEYS})
+    assert set(windows.stats) == set(KEYS) - {"success", "visible"}
+    for key, found in windows.stats.items():
+        values = torch.stack([windows[i][key][0] for i in range(len(windows))]).double()
+        if key == "flow":  # of the last row of an episode nothing is known
+            last = set((windows.episode_ends - 1).tolist())
+            values = values[[i for i in range(len(values)) if i not in last]]
+        channels = values.transpose(1, -1).flatten(0, -2) if values.ndim > 2 else values.view(len(values), -1)
+        if key in ("rgb", "depth"):
+            channels = values.transpose(0, 1).flatten(1).T
+            assert found["mean"].shape == (channels.shape[1], 1, 1)
+        elif values.ndim > 2:
+            channels = values.flatten(0, -2)
+        if key == "depth":
+            channels = channels[channels > 0][:, None]
+        flat = {name: value.flatten().double() for name, value in found.items()}
+        torch.testing.assert_close(flat["min"], channels.amin(0), rtol=1e-5, atol=1e-6, msg=key)
+        torch.testing.assert_close(flat["max"], channels.amax(0), rtol=1e-5, atol=1e-6, msg=key)
+        torch.testing.assert_close(flat["mean"], channels.mean(0), rtol=1e-4, atol=1e-6, msg=key)
+        torch.testing.assert_close(flat["std"], channels.std(0, correction=0), rtol=1e-3, atol=1e-5, msg=key)
+
+
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "key": ({"offsets": {"pointcloud": [0]}}, "no array is called 'pointcloud'; did you mean point_cloud"),
+    "neither": ({}, "give either offsets or delta_timestamps"),
+    "both": ({"offsets": {}, "delta_timestamps": {}}, "give either offsets or delta_timestamps"),
+    "fraction": ({"offsets": {"state": [0.5]}}, r"offsets must be whole numbers of rows, as in .*; found \[0.5\]"),
+    "number": ({"offsets": {"state": 0}}, "offsets must be whole numbers of rows"),
+    "episode": ({"offsets": {"state": [0]}, "episodes": [4]}, "no episode 4; there are 4, counted from 0"),
+    "no episode": ({"offsets": {"state": [0]}, "episodes": []}, "episodes is empty; leave it out for all 4 of them"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_one_sentence(case: str, data: Path) -> None:
+    given, sentence = WRONG[case]
+    with pytest.raises(FlowlabError, match=sentence):
+        Windows(data, **given)
+
+
+def test_pictures_that_are_not_there_are_no_key(tmp_path: Path) -> None:
+    make_dataset(tmp_path / "d", [[make_episode(0)]])
+    with pytest.raises(UsageError, match="no array is called 'rgb'"):
+        Windows(tmp_path / "d", {"rgb": [0]})
