@@ -56,6 +56,11 @@ class Function:
         return (self.node.end_lineno or self.node.lineno) - self.node.lineno + 1
 
     @property
+    def is_private(self) -> bool:
+        """Whether it, or the class it belongs to, begins with an underscore."""
+        return any(part.startswith("_") for part in self.name.split("."))
+
+    @property
     def is_magic(self) -> bool:
         """Whether Python itself gives the name its meaning."""
         return self.node.name.startswith("__") and self.node.name.endswith("__")
@@ -128,8 +133,17 @@ class House:
         """Of all files."""
         return tuple(f for source in self.sources for f in source.functions())
 
-    def undocumented(self) -> list[str]:
-        """Modules, public classes and functions without a docstring; nested and magic functions need none."""
+    def undocumented(self, *, private: bool = False) -> list[str]:
+        """Modules, classes and functions without a docstring, private functions alone if asked for.
+
+        Nested and magic functions need none.
+        """
+        functions = [f for f in self.functions if not f.nested and not f.is_magic and not _overloaded(f.node)]
+        functions = [f for f in functions if f.is_private == private and not ast.get_docstring(f.node)]
+        named = [f"{f.where} {f.name}" for f in functions]
+        return named if private else self._bare_modules_and_classes() + named
+
+    def _bare_modules_and_classes(self) -> list[str]:
         bare = [s.where() for s in self.sources if not ast.get_docstring(s.tree)]
         for source in self.sources:
             bare += [
@@ -137,8 +151,7 @@ class House:
                 for c in source.classes()
                 if not c.name.startswith("_") and not ast.get_docstring(c)
             ]
-        documented = (f for f in self.functions if not f.nested and not f.is_magic and not _overloaded(f.node))
-        return bare + [f"{f.where} {f.name}" for f in documented if not ast.get_docstring(f.node)]
+        return bare
 
     def unannotated(self) -> list[str]:
         """Functions that do not say what they return."""
@@ -160,20 +173,22 @@ class House:
         return [" -> ".join([*circle, circle[0]]) for circle in _circles(needs)]
 
     def exported(self) -> dict[str, tuple[Source, ast.AST]]:
-        """What ``import flowlab`` offers, by name, and where it is defined."""
-        init = next(s for s in self.sources if s.module == "flowlab")
-        table = next(
-            node.value
-            for node in init.tree.body
-            if isinstance(node, ast.Assign | ast.AnnAssign) and "_LAZY" in ast.dump(_target(node))
-        )
-        assert table is not None
-        return {name: self._definition(module, name) for name, module in _lazy(ast.literal_eval(table))}
+        """What ``import flowlab`` offers, by name, and where it is defined; ``data`` is a room, and offers its own."""
+        offered = [*_lazy_table(self._source("flowlab")), *self._of_data()]
+        return {name: self._definition(module, name) for name, module in offered if module != "flowlab"}
+
+    def _of_data(self) -> list[tuple[str, str]]:
+        there = any(s.module == "flowlab.data.windows" for s in self.sources)
+        return [("Windows", "flowlab.data.windows")] if there else []
+
+    def _source(self, module: str) -> Source:
+        found = next((s for s in self.sources if s.module == module), None)
+        if found is None:
+            raise LookupError(f"flowlab exports something of {module}, which does not exist")
+        return found
 
     def _definition(self, module: str, name: str) -> tuple[Source, ast.AST]:
-        source = next((s for s in self.sources if s.module == module), None)
-        if source is None:
-            raise LookupError(f"flowlab/__init__.py exports {name} from {module}, which does not exist")
+        source = self._source(module)
         for node in source.tree.body:
             if getattr(node, "name", None) == name:
                 return source, node
@@ -236,7 +251,7 @@ def _circles(needs: dict[str, set[str]]) -> list[list[str]]:
 def british(root: Path = ROOT, folders: tuple[str, ...] = PROSE) -> list[str]:
     """British words in code and prose. A quoted word alone is a name: of an old setting, say, that is still read."""
     files = [p for folder in folders for kind in ("py", "md", "yaml", "j2") for p in (root / folder).rglob(f"*.{kind}")]
-    files = [p for p in files if "results" not in p.parts and Path(__file__).parent not in p.parents]
+    files = [p for p in files if not {"results", "fixtures"} & set(p.parts) and Path(__file__).parent not in p.parents]
     found = []
     for path in [*sorted(files), root / "README.md", root / "CONTRIBUTING.md", root / "CHANGELOG.md"]:
         text = path.read_text() if path.exists() else ""
@@ -289,17 +304,18 @@ def _overloaded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     return any("overload" in ast.dump(d) for d in node.decorator_list)
 
 
-def _target(node: ast.Assign | ast.AnnAssign) -> ast.expr:
-    return node.targets[0] if isinstance(node, ast.Assign) else node.target
-
-
-def _lazy(table: dict[str, object]) -> Iterator[tuple[str, str]]:
-    """Name and module, of a table of ``name: module`` or of ``module: names``."""
-    for key, value in table.items():
-        if isinstance(value, str):
-            yield key, value
-        elif isinstance(value, list | tuple | set):
-            yield from ((name, key) for name in value)
+def _lazy_table(init: Source) -> Iterator[tuple[str, str]]:
+    """Name and module of each entry of ``_LAZY``, which may have ``**dict.fromkeys(names, module)`` among them."""
+    tables = (n.value for n in init.tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "_LAZY")
+    table = next(tables)
+    assert isinstance(table, ast.Dict)
+    for key, value in zip(table.keys, table.values, strict=True):
+        if key is not None:
+            yield ast.literal_eval(key), ast.literal_eval(value)
+        else:
+            assert isinstance(value, ast.Call)
+            names, module = map(ast.literal_eval, value.args)
+            yield from ((name, module) for name in names)
 
 
 def percentile(numbers: Iterable[int], share: float) -> int:
@@ -320,7 +336,8 @@ def main() -> None:
         ("files above 350 lines", [s.where() for s in house.sources if s.lines > 350]),
         ("import circles", house.circles()),
         ("class names twice", house.twice()),
-        ("without a docstring", house.undocumented()),
+        ("public, without a docstring", house.undocumented()),
+        ("private, without a docstring", house.undocumented(private=True)),
         ("without a return annotation", house.unannotated()),
         ("exported, without a section", house.untold()),
         ("British words", british()),

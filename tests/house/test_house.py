@@ -42,8 +42,12 @@ def test_a_public_class_name_stands_for_one_class() -> None:
     assert not HOUSE.twice(), shown(HOUSE.twice())
 
 
-def test_everything_has_a_docstring() -> None:
+def test_everything_public_has_a_docstring() -> None:
     assert not HOUSE.undocumented(), shown(HOUSE.undocumented())
+
+
+def test_private_functions_have_one_too() -> None:
+    assert not HOUSE.undocumented(private=True), shown(HOUSE.undocumented(private=True))
 
 
 def test_every_function_says_what_it_returns() -> None:
