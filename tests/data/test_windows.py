@@ -18,7 +18,7 @@ from flowlab.data import Windows
 from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 LENGTHS = (9, 14, 6)
 
@@ -159,7 +159,7 @@ def test_rows_that_are_not_evenly_spaced_have_no_times(tmp_path: Path) -> None:
 
 
 def test_a_store_of_dp3_does_not_tell_times(data: Path, tmp_path: Path, episodes: list[Episode]) -> None:
-    export_dp3(Dataset(data), tmp_path / "s.zarr", "roll")
+    DP3Exporter().export(Dataset(data), tmp_path / "s.zarr", "roll")
     windows = Windows(tmp_path / "s.zarr", {"point_cloud": [0], "action": [0, 1]})
     assert len(windows) == sum(LENGTHS)
     assert "tracks" not in windows.keys
