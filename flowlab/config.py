@@ -17,9 +17,10 @@ class SettingsError(UsageError, ValueError):
 
 
 class _OneSentence(ModelMetaclass):
-    """Has a wrong value in ``EncoderSettings(points=0)`` be one sentence; validation from within pydantic is its own."""
+    """Makes a wrong value in ``BatchSettings(windows=0)`` one sentence; what pydantic validates from within stays its
+    own."""
 
-    def __call__(cls, *args: Any, **values: Any) -> Any:
+    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
         try:
             return super().__call__(*args, **values)
         except ValidationError as error:

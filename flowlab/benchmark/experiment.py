@@ -13,13 +13,13 @@ from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
 from flowlab.benchmark.collect import describe_training
 from flowlab.benchmark.results import UNITS, PolicyResult, read_result, write_result
 from flowlab.config import Settings, explain, read_named
+from flowlab.data.settings import TrainSettings
 from flowlab.engines.local import LocalEngine, StartEngine
 from flowlab.errors import DataError, UnfinishedError, UsageError, unknown_name
 from flowlab.evaluation.evaluate import CheckpointRef, find_checkpoints, run_missing
 from flowlab.evaluation.trials import Trial, trials
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
-from flowlab.data.settings import TrainSettings
 from flowlab.policies.checkpoint import RUN, newest_checkpoint, read_run_config, read_trained, step_of
 from flowlab.policies.settings import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
