@@ -17,9 +17,10 @@ from typing import Any
 
 import cv2
 
-from flowlab.grading.grade import Grades, grade, read_clip
-from flowlab.grading.metrics import MetricSettings, average, measure
+from flowlab.grading.grade import TrackerGrade, grade_tracker, read_clip
+from flowlab.grading.metrics import average, measure
 from flowlab.grading.simulate import SimulatedRecording, simulate_recording
+from flowlab.grading.tapvid import MetricSettings
 from flowlab.sim.sensor import CLEAN, KINECT
 from flowlab.tracking.base import Tracker, make_tracker
 from flowlab.tracking.chunking import ChunkSettings
@@ -71,7 +72,7 @@ def main() -> None:
         print(_HEADER)
         for way in ways():
             if arguments.only in (None, way.name):
-                grades = grade(recordings, way.tracker, way.chunks, way.lifting)
+                grades = grade_tracker(recordings, way.tracker, way.chunks, way.lifting)
                 figures.setdefault(name, {})[way.name] = _figures(grades, recordings)
                 print(_row(way.name, figures[name][way.name]), flush=True)
     if arguments.json:
@@ -86,7 +87,7 @@ def _simulated(folder: Path, kind: str) -> list[Path]:
     return places
 
 
-def _figures(grades: Grades, recordings: Sequence[Path]) -> dict[str, Any]:
+def _figures(grades: TrackerGrade, recordings: Sequence[Path]) -> dict[str, Any]:
     rows = [
         measure(g.estimate, g.truth, read_clip(path).camera, TARGET_RULE)
         for g, path in zip(grades.rows, recordings, strict=True)

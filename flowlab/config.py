@@ -17,8 +17,7 @@ class SettingsError(UsageError, ValueError):
 
 
 class _OneSentence(ModelMetaclass):
-    """Makes a wrong value in ``BatchSettings(windows=0)`` one sentence; what pydantic validates from within stays its
-    own."""
+    """Has a wrong value in ``EncoderSettings(points=0)`` be one sentence; pydantic's own validation is left to it."""
 
     def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
         try:
@@ -55,22 +54,38 @@ def _shipped() -> Any:
     return installed if installed.is_dir() else Path(__file__).parents[1] / "pipelines"
 
 
-def override(values: dict[str, Any], text: str, known: Iterable[str], example: str) -> None:
-    """Apply ``key.path=value`` to nested settings; the first part must be one of ``known``."""
+def override(values: dict[str, Any], text: str, known: Iterable[str], example: str, kind: str = "setting") -> None:
+    """Apply a change to nested settings, in place.
+
+    Args:
+        values: The settings, as YAML has them.
+        text: The change, ``key.path=value``; the value is YAML.
+        known: What the first key must be one of.
+        example: Such a change, for people who wrote another thing.
+        kind: What ``known`` are, in the words of an error.
+
+    Raises:
+        UsageError: The change is none, or does not fit the settings.
+    """
     key, equals, _ = text.partition("=")
     path = key.split(".")
     if not equals or not all(path):
         raise UsageError(f"--set {text}: must look like {example}")
     if path[0] not in known:
-        raise unknown_name("setting", path[0], known)
+        raise unknown_name(kind, path[0], known)
     set_value(values, path, text)
 
 
 def set_value(values: dict[str, Any], path: Sequence[str], text: str) -> None:
-    """Put the YAML value behind the ``=`` of an override at a path of keys."""
+    """Put the YAML value behind the ``=`` of a change at a path of keys.
+
+    A group of settings that is switched off, or on with its defaults, is on with this value then.
+    """
     target, value = values, text.partition("=")[2]
     for part in path[:-1]:
-        target = target.setdefault(part, {})
+        if target.get(part) is None or isinstance(target[part], bool):
+            target[part] = {}
+        target = target[part]
         if not isinstance(target, dict):
             raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
     try:

@@ -17,9 +17,17 @@ class UsageError(FlowlabError):
 
 
 class DataError(FlowlabError):
-    """A dataset on disk that is missing, half written, damaged, or made with other settings."""
+    """Data that are missing, half written, damaged, made with other settings, or that do not fit what they are for."""
 
     exit_code = 3
+
+
+class MissingFileError(DataError, FileNotFoundError):
+    """A file or folder that does not exist."""
+
+
+class RecordError(DataError, ValueError):
+    """A value that does not fit the record it was given to, such as a depth picture in millimeters."""
 
 
 class UnfinishedError(FlowlabError):

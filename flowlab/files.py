@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, MissingFileError
 
 
 def temporary_path(path: Path) -> Path:
@@ -27,6 +27,24 @@ def remove_leftovers(folder: Path) -> None:
             shutil.rmtree(leftover, ignore_errors=True)
         else:
             leftover.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that is there whole or not at all.
+
+    Gives an empty folder beside it to fill, which takes its name in the end, or is deleted if anything is raised.
+    What processes that no longer run were making beside it is deleted first.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path.parent)
+    temporary = temporary_path(path)
+    try:
+        temporary.mkdir()
+        yield temporary
+        os.rename(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _prefix() -> str:
@@ -76,6 +94,6 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text())
     except FileNotFoundError as error:
-        raise DataError(f"{path}: there is no such file") from error
+        raise MissingFileError(f"{path}: there is no such file") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not valid JSON ({error}); restore it or extract again into a new folder") from error

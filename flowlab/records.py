@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int16, Int32, UInt8
 
 from flowlab.geometry.camera import Camera
+from flowlab.shapes import Record
 
 
 class Role(IntEnum):
@@ -43,8 +44,8 @@ class Entity:
     role: Role
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+@dataclass(frozen=True, slots=True, repr=False)
+class Frame(Record):
     """One depth picture of a calibrated camera, with what else is known of its pixels."""
 
     depth: Float32[np.ndarray, "H W"]
@@ -55,9 +56,14 @@ class Frame:
     entities: tuple[Entity, ...] = ()
     rgb: UInt8[np.ndarray, "H W 3"] | None = None
 
+    def _check_values(self) -> None:
+        if (self.depth < 0).any():
+            v, u = np.argwhere(self.depth < 0)[0]
+            raise self._wrong("depth", f"is {self.depth[v, u]:g} m at pixel ({u}, {v}), expected 0 or more")
 
-@dataclass(frozen=True, slots=True)
-class Cloud:
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Cloud(Record):
     """All points of one frame that lie in the crop, in pixel order."""
 
     xyz_world: Float32[np.ndarray, "P 3"]
@@ -67,8 +73,8 @@ class Cloud:
     entities: tuple[Entity, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+@dataclass(frozen=True, slots=True, repr=False)
+class Observation(Record):
     """What a policy sees of the scene at one instant."""
 
     points_world: Float32[np.ndarray, "N 3"]
@@ -77,8 +83,8 @@ class Observation:
     """How many of the points are distinct; the rest repeat them (or are zero, in the DP3 profile)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Queries:
+@dataclass(frozen=True, slots=True, repr=False)
+class Queries(Record):
     """The points to follow, on the first frame."""
 
     xyz_world: Float32[np.ndarray, "M 3"]
@@ -87,10 +93,22 @@ class Queries:
     count: int
     """How many are distinct; the rest repeat them."""
     entities: tuple[Entity, ...] = ()
+    pixel: Int32[np.ndarray, "M"] | None = None
+    """Flat index ``v * W + u`` of each point's pixel in the first frame; None where it is not known, as in episodes
+    that were stored."""
+
+    def _check_values(self) -> None:
+        if not 0 <= self.count <= len(self.owner):
+            raise self._wrong("count", f"is {self.count}, expected 0 to {len(self.owner)}, the number of points")
+        if len(self.owner) and not (self.owner.min() >= -1 and self.owner.max() < len(self.entities)):
+            found = f"{self.owner.min()} to {self.owner.max()}"
+            raise self._wrong(
+                "owner", f"ranges from {found}, expected -1 to {len(self.entities) - 1}, as of the entities"
+            )
 
 
-@dataclass(frozen=True, slots=True)
-class Clip:
+@dataclass(frozen=True, slots=True, repr=False)
+class Clip(Record):
     """A whole demonstration as one camera saw it: what a tracker works on."""
 
     rgb: UInt8[np.ndarray, "T H W 3"]
@@ -102,8 +120,8 @@ class Clip:
         return len(self.rgb)
 
 
-@dataclass(frozen=True, slots=True)
-class Tracks2D:
+@dataclass(frozen=True, slots=True, repr=False)
+class Tracks2D(Record):
     """Where a tracker says every query point is in the picture."""
 
     xy: Float32[np.ndarray, "T M 2"]
@@ -116,8 +134,9 @@ class Tracks2D:
     """How far a point lands from its start when tracked there and back [px]; -1 where not measured."""
     disagreement: Float32[np.ndarray, "T M"] | None = None
     """How far apart overlapping chunks put the point [px]; -1 where only one chunk covers it."""
-    depth: Float32[np.ndarray, "T M"] | None = None
-    """z-depth [m] where a model of the motion gives it, for points out of sight too; 0 where none does."""
+    xyz_cam: Float32[np.ndarray, "T M 3"] | None = None
+    """Position in the camera frame [m] where a model of the motion gives it, for points out of sight too; (0, 0, 0)
+    where none does."""
     residual: Float32[np.ndarray, "T M"] | None = None
     """How badly that model explains color and depth around the point, 0 to 1; -1 where none does."""
 
@@ -135,8 +154,8 @@ class PositionSource(IntEnum):
     """Neither: interpolated between instants at which it was known, or held at the last."""
 
 
-@dataclass(frozen=True, slots=True)
-class FlowPrediction:
+@dataclass(frozen=True, slots=True, repr=False)
+class FlowPrediction(Record):
     """Where a policy expected the query points of an episode to go, plan by plan."""
 
     step: Int[np.ndarray, "P"]
@@ -145,8 +164,8 @@ class FlowPrediction:
     """Row 0: where every query point truly was then [m]; row k: where it was expected after k more actions."""
 
 
-@dataclass(frozen=True, slots=True)
-class Quality:
+@dataclass(frozen=True, slots=True, repr=False)
+class Quality(Record):
     """What is known of the error of tracks that were estimated from pictures."""
 
     sigma: Float32[np.ndarray, "T M"]
@@ -163,8 +182,8 @@ class Quality:
     """See :class:`Tracks2D`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tracks3D:
+@dataclass(frozen=True, slots=True, repr=False)
+class Tracks3D(Record):
     """Where every query point is at every instant."""
 
     xyz_world: Float32[np.ndarray, "T M 3"]
@@ -176,8 +195,8 @@ class Tracks3D:
     """None for exact tracks."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Demonstration(ABC):
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Demonstration(Record, ABC):
     """A demonstration one can look at: a simulated rollout, or a recording of a real robot."""
 
     task: str
@@ -203,8 +222,8 @@ class Demonstration(ABC):
         """The picture taken at step ``t``, before action ``t``."""
 
 
-@dataclass(frozen=True, slots=True)
-class ObservedDemo:
+@dataclass(frozen=True, slots=True, repr=False)
+class ObservedDemo(Record):
     """A demonstration, and what the Observer saw of it."""
 
     demo: Demonstration
@@ -216,16 +235,16 @@ class ObservedDemo:
     rgb: UInt8[np.ndarray, "T H W 3"] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class QueriedDemo:
+@dataclass(frozen=True, slots=True, repr=False)
+class QueriedDemo(Record):
     """An observed demonstration, and the points to follow through it."""
 
     observed: ObservedDemo
     queries: Queries
 
 
-@dataclass(frozen=True, slots=True)
-class TrackedDemo:
+@dataclass(frozen=True, slots=True, repr=False)
+class TrackedDemo(Record):
     """A demonstration whose query points have been followed in the picture."""
 
     queried: QueriedDemo
@@ -234,8 +253,8 @@ class TrackedDemo:
     """Name, license and version of the tracker, and what weights it used."""
 
 
-@dataclass(frozen=True, slots=True)
-class Episode:
+@dataclass(frozen=True, slots=True, repr=False)
+class Episode(Record):
     """One labeled demonstration, as it is stored. Row t of every array is the same instant; fields that a
     :class:`Demonstration` has too mean the same."""
 

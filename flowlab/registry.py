@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from flowlab.errors import UsageError, first_line, unknown_name
@@ -40,9 +41,23 @@ class Registry(Generic[T]):
         """Entry-point group in which packages offer their own."""
         self._base = base
 
+    def offers(self) -> tuple[Plugin, ...]:
+        """Everything that is installed, one name possibly several times; nothing is imported."""
+        return tuple(Plugin(self.family, e.name, e.value, _package(e)) for e in self._entries())
+
     def plugins(self) -> dict[str, Plugin]:
         """Everything that is installed, by name; nothing is imported."""
-        return {e.name: Plugin(self.family, e.name, e.value, _package(e)) for e in self._entries()}
+        return {plugin.name: plugin for plugin in self.offers()}
+
+    def problem(self, plugin: Plugin) -> str:
+        """Why a plug-in cannot be used, in a sentence; empty where it can. It is imported for that."""
+        try:
+            self.load(plugin.name)
+        except UsageError as error:
+            return str(error)
+        except Exception as error:  # whatever its module does
+            return f"{self.kind} '{plugin.name}' of {plugin.package}: cannot be imported ({first_line(error)})"
+        return ""
 
     def load(self, name: str, folder: Path | None = None) -> type[T]:
         """The class of that name, or at that import path ``module:Class``.
@@ -84,9 +99,13 @@ class Registry(Generic[T]):
 
     def _from_path(self, place: str, folder: Path | None) -> Any:
         module, _, attribute = place.partition(":")
+        package = module.partition(".")[0]
+        _forget_others(package, folder)
         with _looked_at_last(folder):
             try:
-                return getattr(importlib.import_module(module), attribute)
+                imported = importlib.import_module(module)
+                _remember(package, imported, folder)
+                return getattr(imported, attribute)
             except Exception as error:  # whatever somebody's module does
                 raise UsageError(f"{self.kind} '{place}': cannot be imported ({first_line(error)})") from error
 
@@ -99,6 +118,14 @@ EXPORTERS: Registry[Any] = Registry("exporters", "exporter", "flowlab.storage.ex
 ENGINES: Registry[Any] = Registry("engines", "engine", "flowlab.engines.base:Engine")
 LOGGERS: Registry[Any] = Registry("loggers", "logger", "flowlab.training.loggers:MetricsLogger")
 REGISTRIES = (TRACKERS, READERS, STAGES, POLICIES, EXPORTERS, ENGINES, LOGGERS)
+
+
+def registry_of(family: str) -> Registry[Any]:
+    """The registry of a family, such as ``trackers``. Raises :class:`UsageError` with the names of all."""
+    known = {registry.family: registry for registry in REGISTRIES}
+    if family not in known:
+        raise unknown_name("family of plug-ins", family, known)
+    return known[family]
 
 
 def _is_a(cls: type, base: type) -> bool:
@@ -115,6 +142,24 @@ def _members(protocol: type) -> list[str]:
 
 def _package(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"
+
+
+_lent: dict[str, Path] = {}
+"""Folder that a module or package was imported from because it was lent for that, by its name."""
+
+
+def _forget_others(name: str, folder: Path | None) -> None:
+    """Forget a package's modules that another folder lent: nobody may get those of somebody else."""
+    if folder is not None and _lent.get(name, folder.resolve()) != folder.resolve():
+        del _lent[name]
+        for module in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+            del sys.modules[module]
+
+
+def _remember(name: str, module: ModuleType, folder: Path | None) -> None:
+    """Remember that a package's module is from a folder, where it is."""
+    if folder is not None and Path(module.__file__ or "").resolve().is_relative_to(folder.resolve()):
+        _lent[name] = folder.resolve()
 
 
 @contextmanager

@@ -98,28 +98,6 @@ def comparisons(trials: Sequence[RobotTrial]) -> list[RobotComparison]:
     ]
 
 
-def robot_trial_tables(trials: Sequence[RobotTrial]) -> list[tuple[str, list[str], list[list[object]]]]:
-    """Tables of both, each with its title and its columns; the second only where policies share trials."""
-    counts: list[list[object]] = [
-        [x.task, x.policy, x.success.successes, x.success.n, _percent(x.success.share), _interval(x.success)]
-        for x in successes(trials)
-    ]
-    pairs: list[list[object]] = [
-        [c.task, f"{c.first}, {c.second}", p.n, p.both, p.first_only, p.second_only, p.neither, round(p.p_value, 4)]
-        for c in comparisons(trials)
-        if (p := c.paired)
-    ]
-    tables = [
-        ("scored trials; Wilson's intervals", ["task", "policy", "solved", "of", "%", "95 % interval"], counts),
-        (
-            "on the same trials; p: McNemar, exact, two-sided",
-            ["task", "policies", "trials", "both", "first only", "second only", "neither", "p"],
-            pairs,
-        ),
-    ]
-    return [table for table in tables if table[2]]
-
-
 def _rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
     """Lines that are not empty: the number of each, and its cells without blanks around them."""
     reader = csv.reader(file, strict=True)
@@ -183,11 +161,3 @@ def _by_policy(trials: Sequence[RobotTrial]) -> dict[str, dict[tuple[str, str], 
 def _scopes(trials: Sequence[RobotTrial]) -> list[str]:
     tasks = list(dict.fromkeys(x.task for x in trials))
     return [*tasks, ALL] if len(tasks) > 1 else tasks
-
-
-def _percent(share: float) -> float:
-    return round(100 * share, 1)
-
-
-def _interval(share: Proportion) -> str:
-    return f"{100 * share.low:.0f} - {100 * share.high:.0f}"

@@ -2,11 +2,13 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scipy.stats import binomtest
 
 CONFIDENCE = 0.95
+DIGITS = 6
+"""After the point, of what is kept: more would differ between machines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,13 @@ def wilson(successes: int, n: int) -> Proportion:
     """Wilson's interval. Source: scipy's ``binomtest``."""
     interval = binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
     return Proportion(successes, n, float(interval.low), float(interval.high))
+
+
+def share_of(solved: Iterable[bool]) -> Proportion:
+    """Wilson's interval of some outcomes, rounded so that it is the same on every machine."""
+    values = list(solved)
+    share = wilson(sum(values), len(values))
+    return replace(share, low=round(share.low, DIGITS), high=round(share.high, DIGITS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,3 +62,9 @@ def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> PairedComparison:
     first, second = count[True, False], count[False, True]
     p = float(binomtest(first, first + second).pvalue) if first + second else 1.0
     return PairedComparison(count[True, True], first, second, count[False, False], p)
+
+
+def compare_pairs(pairs: Iterable[tuple[bool, bool]]) -> PairedComparison:
+    """McNemar's test, rounded so that it is the same on every machine."""
+    paired = mcnemar(pairs)
+    return replace(paired, p_value=round(paired.p_value, DIGITS + 4))

@@ -22,6 +22,7 @@ _COMMANDS = {
     "validate": ("flowlab.cli.datasets:validate", "Check a dataset for everything that would spoil training."),
     "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording, a film or a PNG."),
     "export": ("flowlab.cli.datasets:export", "Write a dataset in another tool's layout."),
+    "plugins": ("flowlab.cli.plugins:plugins", "List trackers, readers, stages, policies and more, and from where."),
 }
 
 

@@ -1,18 +1,17 @@
 """``flowlab bench``."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import console, print_json
-from flowlab.cli.results import print_results
+from flowlab.cli.console import console, print_json, print_tables
+from flowlab.cli.evaluate import echo_report, parse_seeds
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
-    from flowlab.benchmark.results import PolicyResult
+    from flowlab.evaluation.results import PolicyResult
 
 
 @click.command()
@@ -20,11 +19,12 @@ if TYPE_CHECKING:
 @click.option("--recipe", default="paper", show_default=True, help="An experiment's name, or a YAML file.")
 @click.option("--group", "groups", multiple=True, help="All tasks of a difficulty, instead of the recipe's tasks.")
 @click.option("--task", "tasks", multiple=True, help="A task, instead of the recipe's; may be repeated.")
-@click.option("--policies", metavar="NAME,...", help="Of fdp, dp3, mba  [the recipe's].")
+@click.option("--policies", metavar="NAME,...", help="Kinds of policies: see flowlab plugins  [the recipe's].")
 @click.option("--variants", metavar="NAME,...", help="Of the recipe's variants; none for no variants  [all].")
 @click.option("--budget", metavar="TIME", help="Training of each policy, as 10m, 90s or 1.5h  [the recipe's].")
 @click.option("--episodes", type=click.IntRange(min=1), help="Of each seed  [the recipe's].")
 @click.option("--seeds", metavar="N,...", help="Evaluation seeds  [the recipe's].")
+@click.option("--engine", default="local", show_default=True, help="What runs the workers: see flowlab plugins.")
 @click.option("--workers", type=click.IntRange(min=1), help="Policies trained at a time  [one for each core].")
 @click.option("--device", help="Where to train: cpu, cuda  [a GPU if there is one].")
 @click.option("--dry-run", is_flag=True, help="Say what would be done; do nothing.")
@@ -39,6 +39,7 @@ def bench(
     budget: str | None,
     episodes: int | None,
     seeds: str | None,
+    engine: str,
     workers: int | None,
     device: str | None,
     dry_run: bool,
@@ -53,51 +54,46 @@ def bench(
     Every policy is a unit of work, done by one process. Ended early, the same command does the rest: a unit is done
     once its result is in OUT/units, and neither runs nor datasets are needed for it then.
     """
-    from flowlab.benchmark import experiment
-    from flowlab.cli.evaluate import numbers
-    from flowlab.report.html import write_report
+    from flowlab.benchmark.experiment import run_experiment
+    from flowlab.benchmark.recipe import load_experiment, with_variants
+    from flowlab.benchmark.summary import summarize
+    from flowlab.benchmark.units import plan_cost, plan_units
+    from flowlab.report.tables import summary_tables
+    from flowlab.report.write import write_report
 
     changes: dict[str, Any] = {
         "tasks": (*groups, *tasks) or None,
         "policies": tuple(_names(policies)) if policies else None,
         "minutes": _minutes(budget) if budget else None,
         "episodes": episodes,
-        "seeds": numbers(seeds) if seeds else None,
+        "seeds": parse_seeds(seeds) if seeds else None,
         "device": device,
     }
-    asked = experiment.load_experiment(recipe, **{k: v for k, v in changes.items() if v is not None})
+    asked = load_experiment(recipe, **{k: v for k, v in changes.items() if v is not None})
     if variants is not None:
-        asked = experiment.with_variants(asked, [] if variants == "none" else _names(variants))
-    units = experiment.plan_units(asked)
-    workers = workers or len(os.sched_getaffinity(0))
+        asked = with_variants(asked, [] if variants == "none" else _names(variants))
     if dry_run:
-        hours = len(units) * asked.minutes / 60
+        units = plan_units(asked)
         for unit in units:
             click.echo(unit.name)
-        click.echo(
-            f"{len(units)} policies, {asked.minutes:g} minutes of training each: {hours:.1f} hours of one core, "
-            f"{hours / workers:.1f} on {workers}"
-        )
+        click.echo(plan_cost(asked, len(units), workers))
         return
-    told: set[str] = set()
-
-    def show(results: Sequence["PolicyResult"], of: int) -> None:
-        fresh, before = [r for r in results if r.name not in told], bool(told)
-        told.update(r.name for r in results)
-        if as_json:
-            return
-        for r in fresh if before or len(fresh) < of else []:
-            solved = sum(o.success for o in r.final)
-            console.print(f"{r.name}: {solved} of {len(r.final)} solved", highlight=False)
-        console.print(f"{len(results)} of {of} policies done", highlight=False)
-
-    results = experiment.run_experiment(asked, out, workers, show)
-    write_report(out, results)
+    progress = None if as_json else _print_progress
+    results = run_experiment(asked, out, engine=engine, workers=workers, on_progress=progress)
+    summary = summarize(results)
+    write_report(out, summary, results)
     if as_json:
         print_json([r.model_dump(mode="json", exclude_defaults=True) for r in results])
         return
-    print_results(results)
-    click.echo(f"{out / 'report.html'}, with report.json, report.csv and episodes.csv beside it")
+    print_tables(summary_tables(summary))
+    echo_report(out)
+
+
+def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> None:
+    for r in fresh:
+        solved = sum(o.success for o in r.final)
+        console.print(f"{r.name}: {solved} of {len(r.final)} solved", highlight=False)
+    console.print(f"{done} of {total} policies done", highlight=False)
 
 
 def _names(text: str) -> list[str]:

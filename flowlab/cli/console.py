@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import click
 from rich.console import Console
@@ -11,6 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from flowlab.pipeline.scheduling import ExtractionProgress
+    from flowlab.report.tables import Table as ReportTable
     from flowlab.training.trainer import TrainingProgress
 
 console = Console(stderr=True)
@@ -31,56 +33,27 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], title:
     Console().print(table)
 
 
+def print_tables(tables: Sequence["ReportTable"]) -> None:
+    """Several of them, each with its title."""
+    for table in tables:
+        print_table(table.columns, table.rows, table.title)
+
+
 def print_json(values: Any) -> None:
     """One JSON document on standard output."""
     click.echo(json.dumps(values, indent=1))
 
 
+EPISODES_LINE = "{what}: {done} of {total} episodes, {spent:.0f} s{left}"
+STEPS_LINE = "step {done} of {total}: {note}{left}"
+"""What a line of progress says, elsewhere than on a terminal."""
+
+
 class ProgressBar:
-    """Episodes done and time left: a bar on a terminal, a plain line now and then elsewhere."""
+    """What is done and time left: a bar on a terminal, a plain line now and then elsewhere."""
 
-    def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task = self._bar.add_task("starting", total=None)
-        self._start = self._last_line = time.monotonic()
-        self._done_at_start: int | None = None
-
-    def __enter__(self) -> "ProgressBar":
-        self._bar.start()
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self._bar.stop()
-
-    def update(self, done: int, total: int, note: str) -> None:
-        """Show that ``done`` of ``total`` episodes are there."""
-        self._bar.update(self._task, completed=done, total=total, description=note)
-        now = time.monotonic()
-        if self._done_at_start is None:
-            self._done_at_start = done
-        due = now - self._last_line > _SECONDS_BETWEEN_LINES or done == total
-        if not self._quiet and not console.is_terminal and due:
-            fresh = done - self._done_at_start
-            left = f", {(now - self._start) / fresh * (total - done):.0f} s left" if fresh else ""
-            console.print(f"{note}: {done} of {total} episodes, {now - self._start:.0f} s{left}", highlight=False)
-            self._last_line = now
-
-
-class TrainingBar:
-    """Steps done, speed and time left of a training run: a bar on a terminal, a plain line now and then elsewhere."""
-
-    def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
+    def __init__(self, quiet: bool, line: str = EPISODES_LINE) -> None:
+        self._quiet, self._line = quiet, line
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -93,30 +66,41 @@ class TrainingBar:
             speed_estimate_period=300,
             disable=quiet or not console.is_terminal,
         )
-        self._task = self._bar.add_task("training", total=None, note="")
+        self._task = self._bar.add_task("starting", total=None, note="")
         self._start = self._last_line = time.monotonic()
-        self._first_step: int | None = None
+        self._done_at_start: int | None = None
 
-    def __enter__(self) -> "TrainingBar":
+    def __enter__(self) -> Self:
         self._bar.start()
         return self
 
     def __exit__(self, *failure: object) -> None:
         self._bar.stop()
 
-    def update(self, progress: "TrainingProgress") -> None:
-        """Show how far a run is."""
-        note = f"{progress.samples_per_s:,.0f} windows/s, loss {progress.loss:.4f}"
-        if progress.validation:
-            note += f", held out: action {progress.validation['action_l1']:.4f}"
-        self._bar.update(self._task, completed=progress.step, total=progress.steps, note=note)
+    def update(self, done: int, total: int, what: str, note: str = "") -> None:
+        """Show that ``done`` of ``total`` are there, and what else there is to say of them."""
+        self._bar.update(self._task, completed=done, total=total, description=what, note=note)
         now = time.monotonic()
-        if self._first_step is None:
-            self._first_step = progress.step
-        if self._quiet or console.is_terminal:
-            return
-        if now - self._last_line > _SECONDS_BETWEEN_LINES or progress.step == progress.steps:
-            left = (now - self._start) / max(progress.step - self._first_step, 1) * (progress.steps - progress.step)
-            known = f", {left:.0f} s left" if progress.step > self._first_step else ""
-            console.print(f"step {progress.step} of {progress.steps}: {note}{known}", highlight=False)
+        if self._done_at_start is None:
+            self._done_at_start = done
+        due = now - self._last_line > _SECONDS_BETWEEN_LINES or done == total
+        if not self._quiet and not console.is_terminal and due:
+            fresh, spent = done - self._done_at_start, now - self._start
+            left = f", {spent / fresh * (total - done):.0f} s left" if fresh else ""
+            values = {"what": what, "done": done, "total": total, "spent": spent, "left": left, "note": note}
+            console.print(self._line.format(**values), highlight=False)
             self._last_line = now
+
+
+def show_training(bar: ProgressBar, progress: "TrainingProgress") -> None:
+    """Show how far a training run is."""
+    note = f"{progress.samples_per_s:,.0f} windows/s, loss {progress.loss:.4f}"
+    if progress.validation:
+        note += f", held out: action {progress.validation['action_l1']:.4f}"
+    bar.update(progress.step, progress.steps, "training", note)
+
+
+def show_extraction(bar: ProgressBar, progress: "ExtractionProgress", doing: str, count_rejects: bool = False) -> None:
+    """Show how far a dataset is; of recordings, what was rejected is done, too."""
+    done = progress.accepted + (progress.rejected if count_rejects else 0)
+    bar.update(done, progress.wanted, f"{doing} ({progress.rejected} rejected)" if progress.rejected else doing)

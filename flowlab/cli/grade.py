@@ -1,23 +1,18 @@
 """``flowlab grade``."""
 
-import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
-import yaml
 from pydantic import ValidationError
 
 from flowlab.cli.console import console, print_json, print_table
-from flowlab.errors import DataError, FlowlabError, MissingLibraryError, UsageError, unknown_name
+from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
-    from flowlab.grading.grade import Grade, Grades
+    from flowlab.grading.grade import RecordingGrade, TrackerGrade
     from flowlab.grading.metrics import TrackErrors
-    from flowlab.grading.simulate import SimulatedRecording
-    from flowlab.tracking.base import Tracker
     from flowlab.tracking.chunking import ChunkSettings
 
 
@@ -62,65 +57,42 @@ def grade(
     are recorded by a simulated depth camera; the recordings are kept in OUT/recordings, and used again by the
     next run with the same settings. OUT/grade.json and OUT/grade.png are written.
     """
-    if not recordings and not tasks:
-        raise UsageError("nothing to grade; give folders with a ground_truth.npz, or --tasks hammer,door-open")
-    _import_simulation()
-    from flowlab.grading.grade import grade as grade_all
-    from flowlab.tracking.lifting import LiftSettings
-
-    chunks, settings = _chunk_settings(chunk, stride), _recording_settings(sensor, size)
-    trackers = [_make_tracker(name, names, changes, weights) for name in dict.fromkeys(names)]
-    folders = [r for path in recordings for r in _find(path)]
+    from flowlab.grading.run import REPORT
+    from flowlab.grading.run import grade as run_grading
+    from flowlab.viz.grade_figure import draw_grades
 
     def say(text: str) -> None:
         if not as_json:
             console.print(text, highlight=False, soft_wrap=True)
 
-    def report(row: "Grade") -> None:
-        say(f"{row.recording}: {row.frames} frames in {row.cpu_s:.1f} s of CPU time")
-
-    with _writing(out):
-        folders += _simulate(tasks, range(seed, seed + episodes), settings, out, say)
-    folders = list({folder.resolve(): folder for folder in folders}.values())
-    results = []
-    for tracker in trackers:
-        say(f"labeling with {tracker.name}")
-        results.append(grade_all(folders, tracker, chunks, LiftSettings(), report=report))
-    document = {
-        "chunks": chunks.model_dump(mode="json"),
-        "simulated": settings.model_dump(mode="json") if tasks else None,
-        "trackers": [r.to_json() for r in results],
-    }
-    with _writing(out):
-        _write(out, results, document)
+    report = run_grading(
+        recordings,
+        out,
+        trackers=names,
+        tasks=[name for name in tasks.replace(" ", "").split(",") if name],
+        episodes=episodes,
+        seed=seed,
+        sensor=sensor,
+        size=_size(size),
+        settings=changes,
+        weights=weights,
+        chunks=_chunk_settings(chunk, stride),
+        on_progress=say,
+    )
+    picture = out / "grade.png"
+    draw_grades({t.name: t.mean for t in report.trackers}, picture, title="error of tracks", about=report.about)
     if as_json:
-        print_json(document)
+        print_json(report.to_json())
         return
-    _print(results)
-    click.echo(f"{out / 'grade.json'} and {out / 'grade.png'}")
+    _print(report.trackers)
+    click.echo(f"{out / REPORT} and {picture}")
 
 
-def _write(out: Path, results: Sequence["Grades"], document: dict[str, Any]) -> None:
-    from flowlab.files import write_json
-    from flowlab.viz.grade_figure import draw_grades
-
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "grade.json", document)
-    rows = results[0].rows
-    about = f"{len(rows)} recordings, {sum(r.frames for r in rows)} frames, {sum(r.queries for r in rows)} query points"
-    draw_grades({r.name: r.mean for r in results}, out / "grade.png", title="error of tracks", about=about)
-
-
-def _import_simulation() -> None:
-    try:
-        import mujoco  # noqa: F401
-    except Exception as error:
-        if "MUJOCO_GL" not in os.environ:
-            raise
-        raise MissingLibraryError(
-            f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
-            "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
-        ) from error
+def _size(text: str) -> tuple[int, int]:
+    width, times, height = text.partition("x")
+    if not (times and width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+        raise UsageError(f"--size {text}: must look like 320x240")
+    return int(width), int(height)
 
 
 def _chunk_settings(chunk: int | None, stride: int | None) -> "ChunkSettings":
@@ -134,82 +106,7 @@ def _chunk_settings(chunk: int | None, stride: int | None) -> "ChunkSettings":
         raise UsageError(f"--chunk, --stride: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
 
 
-def _make_tracker(name: str, names: Sequence[str], changes: Sequence[str], weights: Path | None) -> "Tracker":
-    """A tracker with the options that are meant for it: those without a tracker's name are for all."""
-    from flowlab.tracking.base import make_tracker
-
-    options: dict[str, Any] = {} if weights is None else {"weights": str(weights)}
-    for change in changes:
-        key, equals, value = change.partition("=")
-        whose, _, option = key.rpartition(".")
-        if not equals or not option:
-            raise UsageError(f"--set {change}: must look like KEY=VALUE, or {names[0]}.KEY=VALUE for one tracker")
-        if whose and whose not in names:
-            raise UsageError(f"--set {change}: {unknown_name('tracker of this run', whose, names)}")
-        if whose in ("", name):
-            try:
-                options[option] = yaml.safe_load(value)
-            except yaml.YAMLError as error:
-                raise UsageError(f"--set {change}: not valid YAML: '{value}'") from error
-    return make_tracker(name, options)
-
-
-def _find(path: Path) -> list[Path]:
-    """The recordings with known truth at or below a path."""
-    from flowlab.grading.ground_truth import FILE_NAME
-
-    if not path.exists():
-        raise DataError(f"{path}: there is no such folder")
-    found = sorted(file.parent for file in path.rglob(FILE_NAME))
-    if not found:
-        raise DataError(
-            f"{path}: no recording at or below it has a {FILE_NAME}, so its truth is not known (see docs/grading.md); "
-            "without recordings of your own, give --tasks hammer,door-open"
-        )
-    return found
-
-
-def _recording_settings(sensor: str, size: str) -> "SimulatedRecording":
-    from flowlab.grading.simulate import SimulatedRecording
-    from flowlab.sim.sensor import PRESETS
-
-    width, times, height = size.partition("x")
-    if not (times and width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
-        raise UsageError(f"--size {size}: must look like 320x240")
-    settings = SimulatedRecording(sensor=PRESETS[sensor])
-    scene = settings.expert.scene
-    camera = scene.camera.model_copy(update={"width": int(width), "height": int(height)})
-    expert = settings.expert.model_copy(update={"scene": scene.model_copy(update={"camera": camera})})
-    return settings.model_copy(update={"expert": expert})
-
-
-def _simulate(
-    tasks: str, seeds: range, settings: "SimulatedRecording", out: Path, say: Callable[[str], None]
-) -> list[Path]:
-    """Record what is not there yet."""
-    from flowlab.grading.simulate import simulate_recording
-    from flowlab.sim.tasks import GROUPS, select_tasks
-
-    asked = [name for name in tasks.replace(" ", "").split(",") if name]
-    folders = []
-    for task in select_tasks([t for t in asked if t not in GROUPS], [t for t in asked if t in GROUPS]):
-        for seed in seeds:
-            folder = out / "recordings" / f"{task}-{seed}"
-            made = simulate_recording(folder, task, seed, settings)
-            say(f"{folder}: {'recorded' if made else 'there already'}")
-            folders.append(folder)
-    return folders
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise FlowlabError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error
-
-
-def _print(results: Sequence["Grades"]) -> None:
+def _print(results: Sequence["TrackerGrade"]) -> None:
     """Means over the recordings, trackers below each other; then every recording."""
     groups = {"visible": "all", "moved": "moving", "objects": "object", "hidden": "occluded"}
     errors = [
@@ -235,14 +132,14 @@ def _error_figures(errors: "TrackErrors") -> list[object]:
     return [round(errors.median_mm, 1), round(errors.p95_mm, 1), *(round(s, 2) for s in shares)]
 
 
-def _summary(grades: "Grades") -> list[object]:
+def _summary(grades: "TrackerGrade") -> list[object]:
     t, c = grades.mean.tapvid, grades.mean.calibration
     sigma = ["-"] * 3 if c is None else [_share(x) for x in (c.within_1_sigma, c.within_2_sigma, c.rank_correlation)]
     figures = [_share(x) for x in (t.average_jaccard, t.apd, t.occlusion_accuracy, grades.mean.survival)]
     return [grades.name, *figures, *sigma, round(grades.ms_per_frame, 1)]
 
 
-def _row(tracker: str, grade: "Grade") -> list[object]:
+def _row(tracker: str, grade: "RecordingGrade") -> list[object]:
     m, t = grade.metrics, grade.metrics.tapvid
     visible = "-" if m.all is None else round(m.all.median_mm, 1)
     moved = ["-", "-"] if m.moving is None else [round(m.moving.median_mm, 1), round(m.moving.within_20mm, 2)]

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from flowlab.cli.console import print_json, print_table
-from flowlab.cli.results import print_results
+from flowlab.cli.console import print_json, print_tables
+from flowlab.cli.evaluate import echo_report
 from flowlab.errors import UsageError
 
 
@@ -24,25 +24,23 @@ def report(sources: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     A SOURCE is the folder of a bench, a run that `flowlab eval` has evaluated, or a CSV file of trials on a robot that
     somebody scored, with the columns policy, task, trial, success.
     """
-    from flowlab.benchmark.collect import gather
-    from flowlab.benchmark.robot_trials import read_robot_trials, robot_trial_tables
+    from flowlab.benchmark.results import read_results
+    from flowlab.benchmark.robot_trials import read_robot_trials
     from flowlab.benchmark.summary import summarize
-    from flowlab.report.html import write_report
+    from flowlab.report.tables import robot_trial_tables, summary_tables
+    from flowlab.report.write import write_report
 
     tables = [source for source in sources if source.suffix == ".csv"]
-    folders = [source for source in sources if source.suffix != ".csv"]
     if out is None:
         if len(sources) != 1 or tables:
             raise UsageError("--out: say where to write the report, as in --out results/robot")
         out = sources[0]
-    scored = [trial for table in tables for trial in read_robot_trials(table)]
-    results = gather(folders)
-    write_report(out, results, scored=scored)
+    robot_trials = [trial for table in tables for trial in read_robot_trials(table)]
+    results = read_results([source for source in sources if source.suffix != ".csv"])
+    summary = summarize(results)
+    write_report(out, summary, results, robot_trials=robot_trials)
     if as_json:
-        print_json(summarize(results).model_dump(mode="json"))
+        print_json(summary.to_json())
         return
-    if results:
-        print_results(results)
-    for title, columns, rows in robot_trial_tables(scored) if scored else []:
-        print_table(columns, rows, title)
-    click.echo(f"{out / 'report.html'}, with report.json, report.csv and episodes.csv beside it")
+    print_tables([*(summary_tables(summary) if results else []), *robot_trial_tables(robot_trials)])
+    echo_report(out)

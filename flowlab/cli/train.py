@@ -1,12 +1,13 @@
 """``flowlab train``."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import TrainingBar, console, print_json, print_table
+from flowlab.cli.console import STEPS_LINE, ProgressBar, console, print_json, print_table, show_training
 from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
@@ -94,8 +95,8 @@ def train(
 
     first = is_first_process()
     quiet = as_json or not first
-    with TrainingBar(quiet=quiet) as bar, training.stop_on_signal() as should_stop:
-        watch = training.Watch(_silent if quiet else _say, bar.update, should_stop)
+    with ProgressBar(quiet, STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
+        watch = training.Watch(_silent if quiet else _say, partial(show_training, bar), should_stop)
         if resume:
             done = training.resume(
                 source, device=device, threads=threads, precision=precision, logs=logs or None, watch=watch

@@ -1,1 +1,1 @@
-"""Policies in use."""
+"""Trained policies in use: on a robot, or in an evaluation."""

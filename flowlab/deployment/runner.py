@@ -1,27 +1,43 @@
 """A policy's side of one episode: what it remembers, and what it has decided to do."""
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.errors import DataError
+from flowlab.errors import DataError, UsageError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.policies.base import ActionPlan, PolicySpec
 from flowlab.records import Frame, Queries
 
+_NO_POINTS = np.zeros((0, 3), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _ObservedStep:
+    """What a policy needs of one step; what it does not need is empty, or None."""
+
+    points: Float32[np.ndarray, "N 3"]
+    state: Float32[np.ndarray, "S"]
+    rgb: UInt8[np.ndarray, "H W 3"] | None
+    depth: Float32[np.ndarray, "H W"] | None
+
 
 class PolicyRunner:
-    """Shown every step of an episode, gives the action for it.
+    """Shown the frames of an episode that a plan needs, hands out the action of every step.
 
-    Every ``n_action_steps`` steps a plan is due; it looks at the last frames only, so that no others need be taken.
+    Every ``n_action_steps`` steps a plan is due; it is decided on the last frames only, so that no others need be
+    taken.
     """
 
     def __init__(self, spec: PolicySpec, task: str, seed: int, n_action_steps: int | None = None) -> None:
-        if spec.observer is None:
+        needs = spec.settings.needs
+        self._needs_cloud = needs.point_cloud is not None or needs.flow is not None
+        if self._needs_cloud and spec.observer is None:
             raise DataError("the policy was trained on clouds whose making is not known, so nobody can make such again")
         s = spec.settings
         self.spec = spec
@@ -31,49 +47,67 @@ class PolicyRunner:
         """Where the noise of this episode's plans comes from."""
         self.queries: Queries | None = None
         """The points whose motion is predicted; None for policies that predict none."""
-        self._observer = Observer(ObserverSettings.model_validate(spec.observer), task)
+        self._observer = Observer(ObserverSettings.model_validate(spec.observer or {}), task)
         self._task = torch.tensor([spec.tasks.index(task)])
-        self._seen: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=s.n_obs_steps)
-        self._planned: deque[np.ndarray] = deque()
+        self._history: deque[_ObservedStep] = deque(maxlen=s.n_obs_steps)
+        self._actions: deque[np.ndarray] = deque()
 
     @property
-    def plan_is_due(self) -> bool:
-        """Whether the next action needs a plan."""
-        return not self._planned
+    def needs_plan(self) -> bool:
+        """Whether the next action needs a new plan."""
+        return not self._actions
 
     @property
     def needs_frame(self) -> bool:
-        """Whether a plan will look at the frame of this step."""
-        return len(self._planned) < self.spec.settings.n_obs_steps
+        """Whether a plan will be decided on the frame of this step."""
+        return len(self._actions) < self.spec.settings.n_obs_steps
 
-    def see(self, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
-        """Take in a step that the actor looks at. Raises :class:`DataError` where the frame shows nothing."""
-        cloud = self._observer.cloud(frame)
-        needs = self.spec.settings.needs
-        wanted = 0 if needs.point_cloud is None else needs.point_cloud.points
-        points = self._observer.sample(cloud).points_world[:wanted]
-        first = not self._seen
-        if first and needs.flow is not None:
-            self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
+    def observe(self, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
+        """Take in a step that a plan will be decided on.
+
+        Args:
+            frame: What the camera sees: depth [m], the camera's pose in the dataset's world frame, and color where the
+                policy needs it.
+            state: The robot's, laid out as in the training data.
+
+        Raises:
+            DataError: The frame shows nothing.
+            UsageError: The policy needs color, and the frame has none.
+        """
+        needs, first = self.spec.settings.needs, not self._history
+        if needs.rgb and frame.rgb is None:
+            raise UsageError("the policy needs color, and the frame has none; give it as rgb, of the size of the depth")
+        points = _NO_POINTS
+        if self._needs_cloud:
+            cloud = self._observer.cloud(frame)
+            if needs.point_cloud is not None:
+                points = self._observer.sample(cloud).points_world[: needs.point_cloud.points]
+            if first and needs.flow is not None:
+                self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
+        rgb, depth = frame.rgb if needs.rgb else None, frame.depth if needs.depth else None
+        step = _ObservedStep(points, np.asarray(state, np.float32), rgb, depth)
         times = self.spec.settings.n_obs_steps if first else 1  # what was before the first step is taken to be like it
-        self._seen.extend([(points, np.asarray(state, np.float32))] * times)
+        self._history.extend([step] * times)
 
-    def context(self) -> ObservationBatch:
-        """What a plan is to be decided on."""
-        queries = np.zeros((0, 3), np.float32) if self.queries is None else self.queries.xyz_world
+    def observation(self) -> ObservationBatch:
+        """What a plan is to be decided on, as one window."""
+        queries = _NO_POINTS if self.queries is None else self.queries.xyz_world
+        needs, steps = self.spec.settings.needs, self._history
         return ObservationBatch(
-            points=torch.from_numpy(np.stack([points for points, _ in self._seen])),
-            state=torch.from_numpy(np.stack([state for _, state in self._seen])),
-            observed=torch.arange(len(self._seen))[None],
+            points=torch.from_numpy(np.stack([s.points for s in steps])),
+            state=torch.from_numpy(np.stack([s.state for s in steps])),
+            observed=torch.arange(len(steps))[None],
             queries=torch.from_numpy(queries)[None],
             task=self._task,
+            rgb=torch.from_numpy(np.stack([s.rgb for s in steps if s.rgb is not None])) if needs.rgb else None,
+            depth=torch.from_numpy(np.stack([s.depth for s in steps if s.depth is not None])) if needs.depth else None,
         )
 
-    def follow(self, plan: ActionPlan, window: int = 0) -> None:
-        """Do what a plan says for one of its windows."""
+    def execute(self, plan: ActionPlan, window: int = 0) -> None:
+        """Hand out the actions of one window of a plan from now on."""
         now = self.spec.settings.n_obs_steps - 1
-        self._planned.extend(plan.action[window, now : now + self.n_action_steps].cpu().numpy())
+        self._actions.extend(plan.action[window, now : now + self.n_action_steps].cpu().numpy())
 
-    def act(self) -> Float32[np.ndarray, "A"]:
-        """The action of this step."""
-        return self._planned.popleft()
+    def next_action(self) -> Float32[np.ndarray, "A"]:
+        """The action of this step, in the dataset's units."""
+        return self._actions.popleft()

@@ -1,4 +1,4 @@
-"""Where work units run. The pool on this machine is one engine; a cluster's would be another."""
+"""The engine that runs work units on this machine."""
 
 import os
 import signal
@@ -7,18 +7,14 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Self
 
 from pebble import ProcessExpired, ProcessPool
 
+from flowlab.engines.base import Engine, Receipt, Unit, UnitResult
 from flowlab.errors import FlowlabError
 from flowlab.files import is_running
-
-Unit = TypeVar("Unit")
-Receipt = TypeVar("Receipt")
 
 _WORKER_ENVIRONMENT = (
     "OMP_NUM_THREADS",
@@ -31,46 +27,14 @@ _WORKER_ENVIRONMENT = (
 """All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
 
 
-@dataclass(frozen=True, slots=True)
-class UnitResult(Generic[Unit, Receipt]):
-    """What became of a unit: its receipt, or why there is none."""
-
-    unit: Unit
-    receipt: Receipt | None
-    failure: str = ""
-    """Traceback, or how the worker died."""
-
-
-class Engine(Protocol[Unit, Receipt]):
-    """Runs units of some kind and hands back outcomes as they come; units never exchange arrays through it."""
-
-    def submit(self, unit: Unit) -> None:
-        """Start a unit as soon as there is room."""
-        ...
-
-    def next_result(self) -> UnitResult[Unit, Receipt]:
-        """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
-        ...
-
-
-StartEngine = Callable[[Callable[[Unit], Receipt]], AbstractContextManager[Engine[Unit, Receipt]]]
-"""Makes an engine that does units with the given function; leaving the context stops it."""
-
-
-class LocalEngine(Generic[Unit, Receipt]):
+class LocalEngine(Engine[Unit, Receipt]):
     """A pool of processes on this machine.
 
-    A worker that dies loses its own unit only, which is tried once more in a fresh worker. ``imports`` are the modules
-    that they will need.
+    A worker that dies loses its own unit only, which is tried once more in a fresh worker.
     """
 
-    def __init__(
-        self,
-        work: Callable[[Unit], Receipt],
-        workers: int,
-        imports: Sequence[str] = ("flowlab.pipeline.stages.simulation",),
-    ) -> None:
-        self._work, self._workers, self._imports = work, workers, imports
+    def __init__(self, work: Callable[[Unit], Receipt], *, workers: int, imports: Sequence[str] = ()) -> None:
+        super().__init__(work, workers=workers, imports=imports)
         self._tries: dict[Future[Receipt], tuple[Unit, int]] = {}
 
     def __enter__(self) -> Self:
@@ -78,9 +42,9 @@ class LocalEngine(Generic[Unit, Receipt]):
             os.environ.setdefault(name, "1")
         # Workers are forked from a clean process that has imported everything once, and share its memory.
         context = get_context("forkserver")
-        context.set_forkserver_preload(["flowlab.pipeline.worker", *self._imports])
+        context.set_forkserver_preload([*self.imports])
         self._pool = ProcessPool(
-            max_workers=self._workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
+            max_workers=self.workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )
         return self
 
@@ -111,7 +75,7 @@ class LocalEngine(Generic[Unit, Receipt]):
                 return UnitResult(unit, None, "".join(traceback.format_exception(error)))
 
     def _schedule(self, unit: Unit, tries: int) -> None:
-        self._tries[self._pool.schedule(self._work, args=[unit])] = unit, tries
+        self._tries[self._pool.schedule(self.work, args=[unit])] = unit, tries
 
 
 def _start_worker(program: int) -> None:

@@ -1,59 +1,28 @@
 """Evaluate trained policies: which episodes are missing, who tries them, and what came out."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import torch
 
-from flowlab.benchmark.results import Evaluation
 from flowlab.config import Settings
-from flowlab.engines.local import LocalEngine, StartEngine
-from flowlab.errors import DataError, UnfinishedError, UsageError, unknown_name
-from flowlab.evaluation import trials as log
+from flowlab.engines.base import StartEngine, core_count, engine_by_name
+from flowlab.errors import UnfinishedError
+from flowlab.evaluation.checkpoints import CheckpointRef, common_tasks, find_checkpoint, find_checkpoints
+from flowlab.evaluation.episode_log import append_result, read_results, repair_tail
+from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult
 from flowlab.evaluation.rollout import BATCH_SLOTS, SimulatorPool, roll_out
-from flowlab.evaluation.trials import Trial, check_unseen
+from flowlab.evaluation.training_record import describe_run
+from flowlab.evaluation.trials import Trial, check_unseen, list_trials
 from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.checkpoint import (
-    CHECKPOINTS,
-    TrainedPolicy,
-    load_policy,
-    newest_checkpoint,
-    read_trained,
-    step_of,
-)
+from flowlab.policies.checkpoint import load_policy
 from flowlab.sim.simulation import SceneSettings
 
-FOLDER = "evaluation"
-"""Of a run: holds a folder for every checkpoint and number of executed steps."""
-EPISODES = "episodes.jsonl"
-_LARGEST_BLOCK = 40
+_LARGEST_BATCH = 40
 """Episodes given to a worker at a time: few enough that progress shows."""
-
-
-@dataclass(frozen=True, slots=True)
-class CheckpointRef:
-    """A checkpoint to be evaluated."""
-
-    run: Path
-    weights: Path
-    step: int
-    n_action_steps: int
-    """Steps of every plan that are executed."""
-    trained: TrainedPolicy
-
-    @property
-    def episodes(self) -> Path:
-        """Where its outcomes are kept."""
-        return self.run / FOLDER / f"step-{self.step:08d}-execute-{self.n_action_steps}" / EPISODES
-
-    def evaluation(self, wanted: Sequence[Trial]) -> Evaluation:
-        """The outcomes of those of the episodes that have been tried."""
-        known = log.read(self.episodes)
-        return Evaluation(
-            step=self.step, n_action_steps=self.n_action_steps, outcomes=tuple(known[t] for t in wanted if t in known)
-        )
+Progress = Callable[[int, int], None]
+"""Told how many episodes are done, of how many."""
 
 
 class EpisodeBatch(Settings):
@@ -61,107 +30,126 @@ class EpisodeBatch(Settings):
 
     weights: Path
     episodes: Path
-    """The file that outcomes are added to."""
+    """The file that results are added to."""
     scene: SceneSettings
     n_action_steps: int
     trials: tuple[Trial, ...]
     device: str = "cpu"
 
 
-def find_checkpoint(path: Path, n_action_steps: int | None = None) -> CheckpointRef:
-    """The newest checkpoint of a run, or the one that is given.
-
-    Raises :class:`DataError` where there is none, or the policy was not trained in simulation, and
-    :class:`UsageError` where its plans are shorter than ``n_action_steps`` steps.
-    """
-    weights = newest_checkpoint(path) if path.suffix != ".safetensors" else path
-    run = weights.absolute().parents[1] if path.suffix == ".safetensors" else path
-    trained = read_trained(run)
-    s = trained.policy.settings
-    if trained.scene is None or trained.policy.observer is None:
-        raise DataError(
-            f"{path}: was trained on recordings or on a DP3 store ({trained.dataset}), so no simulation shows what it "
-            f"knows; compare it with held-out demonstrations by 'flowlab eval {path} --offline'"
-        )
-    most = s.horizon - s.n_obs_steps + 1
-    if n_action_steps is not None and not 1 <= n_action_steps <= most:
-        raise UsageError(f"--execute {n_action_steps}: {path} plans {most} steps ahead, so execute 1 to {most}")
-    return CheckpointRef(run, weights, step_of(weights), n_action_steps or s.n_action_steps, trained)
-
-
-def find_checkpoints(run: Path, n_action_steps: int | None = None) -> list[CheckpointRef]:
-    """Every checkpoint of a run, oldest first."""
-    newest_checkpoint(run)
-    return [find_checkpoint(path, n_action_steps) for path in sorted((run / CHECKPOINTS).glob("step-*.safetensors"))]
-
-
-def choose_tasks(subjects: Sequence[CheckpointRef], asked: Sequence[str]) -> tuple[str, ...]:
-    """The tasks that are asked for, or all that every policy knows. Raises :class:`UsageError` where there is none."""
-    known = [set(s.trained.policy.tasks) for s in subjects]
-    for subject, tasks in zip(subjects, known, strict=True):
-        for task in asked:
-            if task not in tasks:
-                raise UsageError(f"{subject.run}: {unknown_name('task that it was trained on', task, tasks)}")
-    common = set.intersection(*known)
-    if not common:
-        each = "; ".join(f"{s.run} {', '.join(sorted(k))}" for s, k in zip(subjects, known, strict=True))
-        raise UsageError(f"no task is common to all runs ({each}); evaluate them apart, or make one report of them")
-    return tuple(dict.fromkeys(asked)) or tuple(sorted(common))
-
-
 def evaluate(
-    subjects: Sequence[CheckpointRef],
-    wanted: Sequence[Trial],
+    runs: Path | str | Sequence[Path | str],
     *,
-    start_engine: StartEngine[EpisodeBatch, int],
-    workers: int,
+    tasks: Sequence[str] = (),
+    seeds: Sequence[int] = (0, 1, 2),
+    episodes: int = 20,
+    n_action_steps: int | None = None,
+    checkpoints: bool = False,
+    engine: str = "local",
+    workers: int | None = None,
     device: str = "cpu",
-    report: Callable[[int, int], None] = lambda done, of: None,
-) -> list[Evaluation]:
-    """Try what has not been tried yet, and return all outcomes, for every subject in turn.
+    on_progress: Progress | None = None,
+) -> list[PolicyResult]:
+    """Let trained policies act in simulation, on scenes that none of them was trained on.
 
-    Every outcome is kept as its episode ends, so that an evaluation that was ended goes on where it was. ``report`` is
-    told how many episodes are done, of how many. Raises :class:`UnfinishedError` where workers failed.
+    How every episode went is kept in the run's folder as it ends: ended early, the same call does the rest, and more
+    episodes add to those that are there. What comes out does not depend on the number of workers.
+
+    Args:
+        runs: Folders that :func:`flowlab.train` made, or checkpoints of theirs.
+        tasks: What to try; by default all tasks that every policy was trained on.
+        seeds: Evaluation seeds, which decide the scenes: the same for every policy.
+        episodes: How many to try of each task and seed.
+        n_action_steps: Steps of every plan to execute; by default as many as each policy was trained to.
+        checkpoints: Evaluate every checkpoint of the runs, not the newest alone.
+        engine: Name or import path of what runs the workers.
+        workers: How many; by default one for each core that this process may use.
+        device: Where plans are made, as PyTorch names it.
+        on_progress: Told how many episodes are done, of how many.
+
+    Returns:
+        A result for each run, with an evaluation for each of its checkpoints that were asked for, in order of steps.
+
+    Raises:
+        DataError: A run has no checkpoint, or was not trained in simulation.
+        UsageError: A name or number does not fit, or a scene was trained on.
+        UnfinishedError: Workers failed; the same call tries their episodes again.
     """
-    for subject in subjects:
-        check_unseen(wanted, subject.trained.scene_seeds, subject.run)
-    blocks = [b for s in subjects for b in _missing(s, wanted, workers * 2, device)]
-    blocks.sort(key=lambda b: b.trials[0].task)  # a worker keeps the simulations of the last task
-    if blocks:
-        _try_all(blocks, len(subjects) * len(wanted), start_engine, report)
-    return [s.evaluation(wanted) for s in subjects]
+    paths = [Path(runs)] if isinstance(runs, Path | str) else [Path(run) for run in runs]
+    refs = [ref for path in paths for ref in _checkpoints_of(path, n_action_steps, every=checkpoints)]
+    trials = list_trials(common_tasks(refs, tasks), seeds, episodes)
+    found = evaluate_checkpoints(
+        refs, trials, engine=engine, workers=workers, device=device, on_progress=on_progress or (lambda done, of: None)
+    )
+    by_run: dict[Path, list[CheckpointEvaluation]] = {}
+    for ref, evaluation in zip(refs, found, strict=True):
+        by_run.setdefault(ref.run, []).append(evaluation)
+    return [describe_run(run, evaluations) for run, evaluations in by_run.items()]
 
 
-def run_batch(block: EpisodeBatch) -> int:
-    """A worker's part: try every episode, keep each outcome as it ends, and say how many there were."""
+def evaluate_checkpoints(
+    checkpoints: Sequence[CheckpointRef],
+    trials: Sequence[Trial],
+    *,
+    engine: str,
+    workers: int | None,
+    device: str,
+    on_progress: Progress,
+) -> list[CheckpointEvaluation]:
+    """Try what has not been tried yet, and return all results, for every checkpoint in turn.
+
+    The arguments are those of :func:`evaluate`. Raises :class:`UnfinishedError` where workers failed.
+    """
+    for checkpoint in checkpoints:
+        check_unseen(trials, checkpoint.trained.scene_seeds, checkpoint.run)
+    workers = workers or core_count()
+    batches = [b for c in checkpoints for b in _missing_batches(c, trials, workers * 2, device)]
+    batches.sort(key=lambda b: b.trials[0].task)  # a worker keeps the simulations of the last task
+    if batches:
+        start_engine = engine_by_name(engine, workers, [__name__])
+        _run_batches(batches, len(checkpoints) * len(trials), start_engine, on_progress)
+    return [c.read_evaluation(trials) for c in checkpoints]
+
+
+def evaluate_here(checkpoint: CheckpointRef, trials: Sequence[Trial], device: str = "cpu") -> CheckpointEvaluation:
+    """Try what has not been tried yet in this process, and return all results."""
+    check_unseen(trials, checkpoint.trained.scene_seeds, checkpoint.run)
+    for batch in _missing_batches(checkpoint, trials, 1, device):
+        run_batch(batch)
+    return checkpoint.read_evaluation(trials)
+
+
+def run_batch(batch: EpisodeBatch) -> int:
+    """A worker's part: try every episode, keep each result as it ends, and say how many there were."""
     torch.set_num_threads(1)
-    policy = _policy(block.weights, block.device)
-    stage = _stage(block.trials[0].task, block.scene)
-    known = log.read(block.episodes)  # by a worker that died over this block
-    todo = [trial for trial in block.trials if trial not in known]
-    for attempt in roll_out(policy, stage, todo, n_action_steps=block.n_action_steps):
-        log.append(block.episodes, attempt.outcome)
-    return len(block.trials)
+    policy = _policy(batch.weights, batch.device)
+    simulators = _simulators(batch.trials[0].task, batch.scene)
+    known = read_results(batch.episodes)  # by a worker that died over this batch
+    todo = [trial for trial in batch.trials if trial not in known]
+    for episode in roll_out(policy, simulators, todo, n_action_steps=batch.n_action_steps):
+        append_result(batch.episodes, episode.result)
+    return len(batch.trials)
 
 
-def _try_all(
-    blocks: Sequence[EpisodeBatch],
-    total: int,
-    start_engine: StartEngine[EpisodeBatch, int],
-    report: Callable[[int, int], None],
+def _checkpoints_of(path: Path, n_action_steps: int | None, *, every: bool) -> list[CheckpointRef]:
+    return find_checkpoints(path, n_action_steps) if every else [find_checkpoint(path, n_action_steps)]
+
+
+def _run_batches(
+    batches: Sequence[EpisodeBatch], total: int, start_engine: StartEngine[EpisodeBatch, int], on_progress: Progress
 ) -> None:
-    done = total - sum(len(b.trials) for b in blocks)
-    report(done, total)
+    done = total - sum(len(b.trials) for b in batches)
+    on_progress(done, total)
     failures = []
     with start_engine(run_batch) as engine:
-        for block in blocks:
-            engine.submit(block)
-        for _ in blocks:
+        for batch in batches:
+            engine.submit(batch)
+        for _ in batches:
             ended = engine.next_result()
             if ended.receipt is None:
                 failures.append(ended.failure.strip())
             done += ended.receipt or 0
-            report(done, total)
+            on_progress(done, total)
     if failures:
         raise UnfinishedError(
             f"{total - done} of {total} episodes could not be tried; the first failure: "
@@ -169,30 +157,24 @@ def _try_all(
         )
 
 
-def run_missing(subject: CheckpointRef, wanted: Sequence[Trial], device: str = "cpu") -> None:
-    """Try what has not been tried yet, in this process."""
-    check_unseen(wanted, subject.trained.scene_seeds, subject.run)
-    for block in _missing(subject, wanted, 1, device):
-        run_batch(block)
-
-
-def _missing(subject: CheckpointRef, wanted: Sequence[Trial], parts: int, device: str) -> Iterable[EpisodeBatch]:
-    """Blocks of the episodes that have no outcome yet, at least ``parts`` of them if there are enough episodes."""
-    subject.episodes.parent.mkdir(parents=True, exist_ok=True)
-    log.repair_tail(subject.episodes)
-    known = log.read(subject.episodes)
-    todo = [t for t in wanted if t not in known]
-    rounds = -(-len(todo) // (parts * BATCH_SLOTS))  # every lane of a block has as many episodes
-    size = min(rounds * BATCH_SLOTS, _LARGEST_BLOCK)
-    scene = SceneSettings.model_validate(subject.trained.scene).model_copy(update={"rgb": False})
+def _missing_batches(
+    checkpoint: CheckpointRef, trials: Sequence[Trial], parts: int, device: str
+) -> Iterable[EpisodeBatch]:
+    """Batches of the trials that have no result yet, at least ``parts`` of them if there are enough."""
+    checkpoint.episodes.parent.mkdir(parents=True, exist_ok=True)
+    repair_tail(checkpoint.episodes)
+    known = read_results(checkpoint.episodes)
+    todo = [t for t in trials if t not in known]
+    rounds = -(-len(todo) // (parts * BATCH_SLOTS))  # every slot has as many episodes
+    size = min(rounds * BATCH_SLOTS, _LARGEST_BATCH)
     for task in dict.fromkeys(t.task for t in todo):
         of_task = [t for t in todo if t.task == task]
         for first in range(0, len(of_task), size):
             yield EpisodeBatch(
-                weights=subject.weights,
-                episodes=subject.episodes,
-                scene=scene,
-                n_action_steps=subject.n_action_steps,
+                weights=checkpoint.weights,
+                episodes=checkpoint.episodes,
+                scene=checkpoint.scene,
+                n_action_steps=checkpoint.n_action_steps,
                 trials=tuple(of_task[first : first + size]),
                 device=device,
             )
@@ -204,10 +186,5 @@ def _policy(weights: Path, device: str) -> PolicyNetwork:
 
 
 @lru_cache(maxsize=1)
-def _stage(task: str, scene: SceneSettings) -> SimulatorPool:
+def _simulators(task: str, scene: SceneSettings) -> SimulatorPool:
     return SimulatorPool(task, scene)
-
-
-def local_engine(workers: int) -> StartEngine[EpisodeBatch, int]:
-    """Processes of this machine."""
-    return partial(LocalEngine, workers=workers, imports=[__name__])

@@ -1,4 +1,4 @@
-"""How far predictions of flow are off: several draws of a policy's, and what costs nothing."""
+"""How far predictions of flow are off: several samples of a policy's, and of what needs no policy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from flowlab.config import Settings
 from flowlab.geometry.camera import Camera
-from flowlab.grading.metrics import tapvid
+from flowlab.grading.tapvid import tapvid
 
 
 class FlowError(Settings):
@@ -25,7 +25,7 @@ class FlowError(Settings):
 
 
 class FlowErrors(Settings):
-    """Predicted flow of moving points, drawn several times, beside what costs nothing."""
+    """Predicted flow of moving points, sampled several times, beside what needs no policy."""
 
     draws: int
     pairs: int
@@ -67,31 +67,31 @@ class PointStepErrors:
             pairs=len(self.window),
             ends=ends,
             seen=int(self.visible.sum()),
-            policy=self._guess(self.policy, camera),
-            best_ade_mm=self._best(self.window, self.policy),
-            best_fde_mm=self._best(self.window[self.last], self.policy[:, self.last]),
-            zero=self._guess(self.zero, camera),
-            constant=self._guess(self.constant, camera) if has_past else None,
+            policy=self._error_of(self.policy, camera),
+            best_ade_mm=self._least_error(self.window, self.policy),
+            best_fde_mm=self._least_error(self.window[self.last], self.policy[:, self.last]),
+            zero=self._error_of(self.zero, camera),
+            constant=self._error_of(self.constant, camera) if has_past else None,
         )
 
-    def _guess(self, off: Float[np.ndarray, "D P"], camera: Camera | None) -> FlowError:
+    def _error_of(self, distance: Float[np.ndarray, "D P"], camera: Camera | None) -> FlowError:
         apd = average_jaccard = None
         if camera is not None and self.visible.any():
             _, z = camera.project(self.xyz_world.T.astype(np.float64))
-            shares = [tapvid(e, self.visible, self.visible, z, camera) for e in off]
+            shares = [tapvid(e, self.visible, self.visible, z, camera) for e in distance]
             apd = float(np.mean([x.apd for x in shares]))
             average_jaccard = float(np.mean([x.average_jaccard for x in shares]))
         return FlowError(
-            ade_mm=1e3 * float(off.mean()),
-            fde_mm=1e3 * float(off[:, self.last].mean()),
+            ade_mm=1e3 * float(distance.mean()),
+            fde_mm=1e3 * float(distance[:, self.last].mean()),
             apd=apd,
             average_jaccard=average_jaccard,
         )
 
     @staticmethod
-    def _best(window: Int[np.ndarray, "Q"], off: Float[np.ndarray, "D Q"]) -> float:
+    def _least_error(window: Int[np.ndarray, "Q"], distance: Float[np.ndarray, "D Q"]) -> float:
         """The mean [mm] if every window has the draw whose own mean is least."""
-        totals = np.stack([np.bincount(window, of_draw) for of_draw in off])
+        totals = np.stack([np.bincount(window, of_sample) for of_sample in distance])
         return 1e3 * float(totals.min(0).sum() / len(window))
 
 
@@ -106,19 +106,17 @@ def pool_errors(each: Sequence[FlowErrors]) -> FlowErrors | None:
         pairs=sum(pairs),
         ends=sum(ends),
         seen=sum(seen),
-        policy=_pool_guesses([f.policy for f in each], pairs, ends, seen),
+        policy=_pool([f.policy for f in each], pairs, ends, seen),
         best_ade_mm=float(np.average([f.best_ade_mm for f in each], weights=pairs)),
         best_fde_mm=float(np.average([f.best_fde_mm for f in each], weights=ends)),
-        zero=_pool_guesses([f.zero for f in each], pairs, ends, seen),
-        constant=_pool_guesses(constant, pairs, ends, seen) if constant else None,
+        zero=_pool([f.zero for f in each], pairs, ends, seen),
+        constant=_pool(constant, pairs, ends, seen) if constant else None,
     )
 
 
-def _pool_guesses(
-    each: Sequence[FlowError], pairs: Sequence[int], ends: Sequence[int], seen: Sequence[int]
-) -> FlowError:
+def _pool(each: Sequence[FlowError], pairs: Sequence[int], ends: Sequence[int], seen: Sequence[int]) -> FlowError:
     def mean(name: str, weights: Sequence[int]) -> float | None:
-        known = [(getattr(g, name), w) for g, w in zip(each, weights, strict=True) if getattr(g, name) is not None]
+        known = [(getattr(e, name), w) for e, w in zip(each, weights, strict=True) if getattr(e, name) is not None]
         return float(np.average([v for v, _ in known], weights=[w for _, w in known])) if known else None
 
     return FlowError.model_validate(

@@ -1,87 +1,86 @@
-"""An evaluated episode again, with pictures: as everyone can look at it."""
+"""An evaluated episode again, with pictures large enough to watch, labeled as demonstrations are."""
 
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float32
 
 from flowlab.errors import MissingLibraryError
-from flowlab.evaluation.evaluate import CheckpointRef
-from flowlab.evaluation.rollout import Attempt, SimulatorPool, roll_out
-from flowlab.evaluation.trials import EpisodeResult, Trial
+from flowlab.evaluation.checkpoints import CheckpointRef
+from flowlab.evaluation.results import EpisodeResult
+from flowlab.evaluation.rollout import PolicyRollout, SimulatorPool, roll_out
+from flowlab.evaluation.trials import Trial
 from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.pipeline.stages.shared import ObserverStage, labeled
+from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
-from flowlab.records import Episode, FlowPrediction, ObservedDemo, QueriedDemo
+from flowlab.records import Episode, FlowPrediction, ObservedDemo, QueriedDemo, Queries
 from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
 from flowlab.sim.simulation import SceneSettings
 from flowlab.sim.tracks import RigidFlowSettings, label
-from flowlab.viz.recording import write_rrd
-from flowlab.viz.video import write_video
 
 _TALLEST_PX = 480
 """MetaWorld's models let OpenGL draw no more rows than this."""
 
 
-def film(subject: CheckpointRef, trial: Trial, folder: Path) -> Path:
-    """Write a film (mp4) of an episode and a Rerun recording beside it; returns the film's path."""
-    episode, prediction, outcome = replay(subject, trial)
-    name = f"{subject.run.name}-{trial.task}-seed-{trial.seed}-{trial.episode}"
-    how = f"solved at step {outcome.steps}" if outcome.success else f"not solved in {outcome.steps} steps"
-    title = f"{subject.run.name}: {trial.task}, seed {trial.seed}, episode {trial.episode}, {how}"
-    path = folder / f"{name}-{'solved' if outcome.success else 'failed'}.mp4"
-    write_video(episode, path, title=title, prediction=prediction)
-    write_rrd(episode, path.with_suffix(".rrd"), name=title, prediction=prediction)
-    return path
+@dataclass(frozen=True, slots=True)
+class ReplayedEpisode:
+    """An episode as everyone can look at it."""
+
+    episode: Episode
+    """The clouds that the policy's Observer makes, pictures in color where OpenGL can be had, and true tracks: of the
+    points whose motion the policy predicts, or would be given."""
+    prediction: FlowPrediction | None
+    """None for policies that predict no flow."""
+    result: EpisodeResult
 
 
-def replay(subject: CheckpointRef, trial: Trial) -> tuple[Episode, FlowPrediction | None, EpisodeResult]:
-    """Let a policy try an episode again, which goes as it went before, and label it as demonstrations are.
-
-    The episode has the clouds that the policy's Observer makes, pictures that are large enough to watch, in color
-    where OpenGL can be had, and true tracks: of the points whose motion the policy predicts, or would be given.
-    """
-    scene = SceneSettings.model_validate(subject.trained.scene).model_copy(update={"rgb": False})
-    policy = load_policy(subject.weights).policy
-    attempt = next(roll_out(policy, SimulatorPool(trial.task, scene), [trial], n_action_steps=subject.n_action_steps))
+def replay_episode(checkpoint: CheckpointRef, trial: Trial) -> ReplayedEpisode:
+    """Let a policy try an episode again, which goes as it went before."""
+    policy = load_policy(checkpoint.weights).policy
+    simulators = SimulatorPool(trial.task, checkpoint.scene)
+    tried = next(roll_out(policy, simulators, [trial], n_action_steps=checkpoint.n_action_steps))
     observer = ObserverStage.model_validate({**(policy.spec.observer or {}), "stage": "observer"})
-    seen = observer.process(attempt.rollout)
-    queries = attempt.queries
-    if queries is None:
-        settings = QuerySettings.model_validate(policy.spec.queries)
-        queries = queries_in(seen.first_cloud, seen.depth[0], settings)
-    assert seen.owner is not None
-    tracks = label(attempt.rollout, queries, seen.depth, seen.owner, RigidFlowSettings())
-    shown = _with_large_pictures(seen, scene)
-    episode = labeled(QueriedDemo(shown, queries), tracks, evaluated=attempt.outcome.model_dump(mode="json"))
-    return episode, _prediction(attempt, tracks.xyz_world), attempt.outcome
+    observed = observer.process(tried.rollout)
+    queries = tried.queries if tried.queries is not None else _would_be_queries(policy, observed)
+    assert observed.owner is not None
+    tracks = label(tried.rollout, queries, observed.depth, observed.owner, RigidFlowSettings())
+    demo = QueriedDemo(_with_large_pictures(observed, checkpoint.scene), queries)
+    episode = labeled(demo, tracks, evaluated=tried.result.model_dump(mode="json"))
+    return ReplayedEpisode(episode, _prediction(tried, tracks.xyz_world), tried.result)
 
 
-def _prediction(attempt: Attempt, tracks_world: np.ndarray) -> FlowPrediction | None:
-    if not attempt.predicted:
+def _would_be_queries(policy: PolicyNetwork, observed: ObservedDemo) -> Queries:
+    """The points that a dataset of such scenes has."""
+    return queries_in(observed.first_cloud, observed.depth[0], QuerySettings.model_validate(policy.spec.queries))
+
+
+def _prediction(tried: PolicyRollout, tracks_world: Float32[np.ndarray, "T M 3"]) -> FlowPrediction | None:
+    """The paths that every plan predicted, from where its points were."""
+    if not tried.predicted:
         return None
-    step = np.array([s for s, _ in attempt.predicted])
-    flow = np.stack([f for _, f in attempt.predicted])
+    step = np.array([s for s, _ in tried.predicted])
+    flow = np.stack([f for _, f in tried.predicted])
     here = tracks_world[step][:, None]
     return FlowPrediction(step, np.concatenate([here, here + flow.cumsum(1)], 1).astype(np.float32))
 
 
-def _with_large_pictures(seen: ObservedDemo, scene: SceneSettings) -> ObservedDemo:
+def _with_large_pictures(observed: ObservedDemo, scene: SceneSettings) -> ObservedDemo:
     """The same, but pictures taken anew by a camera with more pixels in the same place."""
-    rollout = seen.demo
+    rollout = observed.demo
     assert isinstance(rollout, Rollout)
     c = scene.camera
     factor = max(1, _TALLEST_PX // c.height)
     camera = c.model_copy(update={"width": factor * c.width, "height": factor * c.height})
-    live = _begin_in_color(rollout, scene.model_copy(update={"camera": camera}))
-    taken = replace(rollout, camera=live.camera, renderer=live.renderer)
+    recorder = _begin_in_color(rollout, scene.model_copy(update={"camera": camera}))
+    taken = replace(rollout, camera=recorder.camera, renderer=recorder.renderer)
     frames = [taken.frame(t) for t in range(len(taken))]
     rgb = None if frames[0].rgb is None else np.stack([f.rgb for f in frames if f.rgb is not None])
-    return replace(seen, demo=taken, depth=np.stack([f.depth for f in frames]), owner=None, rgb=rgb)
+    return replace(observed, demo=taken, depth=np.stack([f.depth for f in frames]), owner=None, rgb=rgb)
 
 
 def _begin_in_color(rollout: Rollout, scene: SceneSettings) -> EpisodeRecorder:
-    """The layout of a rollout; without color where there is no OpenGL."""
+    """The scene of a rollout; without color where there is no OpenGL."""
     try:
         colored = scene.model_copy(update={"renderer": "gl", "rgb": True})
         return TaskSimulator(rollout.task, colored).begin(rollout.seed)

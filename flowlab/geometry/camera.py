@@ -6,9 +6,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num
 
+from flowlab.shapes import Record, Size
 
-@dataclass(frozen=True, slots=True)
-class Camera:
+_ROTATION_TOLERANCE = 1e-3
+"""So much may a rotation times its transpose differ from the identity: what rounding to three digits does."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Camera(Record):
     """A calibrated pinhole camera without distortion.
 
     Axes: x right, y down, z forward. The center of pixel (u, v) lies at integer coordinates (u, v), so
@@ -23,6 +28,36 @@ class Camera:
     """Intrinsics [px]."""
     T_world_cam: Float[np.ndarray, "4 4"]
     """Camera pose: maps camera coordinates to world coordinates [m]."""
+
+    def sizes(self) -> dict[str, Size]:
+        """Of its pictures, too: height and width."""
+        own = {"H": Size(self.height, "height"), "W": Size(self.width, "width")}
+        return {**Record.sizes(self), **own}
+
+    def _check_values(self) -> None:
+        for name in ("width", "height"):
+            if not getattr(self, name) > 0:
+                raise self._wrong(name, f"is {getattr(self, name)}, expected a number of pixels above 0")
+        for name in ("K", "T_world_cam"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise self._wrong(name, "holds a number that is not finite")
+        fx, skew, fy = self.K[0, 0], self.K[0, 1], self.K[1, 1]
+        if not (fx > 0 and fy > 0):
+            raise self._wrong("K", f"has the focal lengths {fx:g} and {fy:g}, expected pixels above 0")
+        if not (np.abs(self.K[2] - [0, 0, 1]).max() < 1e-6 and abs(self.K[1, 0]) < 1e-6 and abs(skew) < 1e-3 * fx):
+            raise self._wrong("K", f"is {self.K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        self._check_pose()
+
+    def _check_pose(self) -> None:
+        R, last = self.T_world_cam[:3, :3], self.T_world_cam[3]
+        if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:
+            raise self._wrong("T_world_cam", f"has the last row {last.tolist()}, expected [0, 0, 0, 1]")
+        off = np.abs(R @ R.T - np.eye(3)).max()
+        if off > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            what = f"is off by {off:.2g}" if off > _ROTATION_TOLERANCE else "mirrors"
+            raise self._wrong(
+                "T_world_cam", f"holds no rotation (it {what}), expected columns that are right-handed axes"
+            )
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float, T_world_cam: np.ndarray) -> "Camera":

@@ -12,18 +12,16 @@ from jaxtyping import Float32
 from flowlab.errors import DataError
 from flowlab.geometry.transforms import apply, inverse
 from flowlab.grading import ground_truth
-from flowlab.grading.ground_truth import GroundTruth
+from flowlab.grading.calibration import Calibration, calibrate
+from flowlab.grading.ground_truth import GroundTruth, unusable_queries
 from flowlab.grading.metrics import (
-    Calibration,
-    Estimate,
-    MetricSettings,
+    EstimatedTracks,
     TrackMetrics,
     average,
-    calibrate,
     errors_m,
     measure,
 )
-from flowlab.grading.simulate import unusable_queries
+from flowlab.grading.tapvid import MetricSettings
 from flowlab.recordings.recording import RecordingSettings, open_recording
 from flowlab.records import Clip
 from flowlab.tracking.base import Tracker
@@ -36,7 +34,7 @@ _FULL_SIZE_PX = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Grade:
+class RecordingGrade:
     """One recording, labeled by one tracker."""
 
     recording: str
@@ -46,7 +44,7 @@ class Grade:
     """Left out of the simulated recording because of ``UNUSABLE_M``."""
     cpu_s: float
     """CPU time of labeling, all threads together."""
-    estimate: Estimate
+    estimate: EstimatedTracks
     truth: GroundTruth
     metrics: TrackMetrics
 
@@ -63,12 +61,12 @@ class Grade:
 
 
 @dataclass(frozen=True, slots=True)
-class Grades:
+class TrackerGrade:
     """All recordings, labeled by one tracker."""
 
     tracker: Mapping[str, Any]
     """What :meth:`flowlab.tracking.base.Tracker.describe` says."""
-    rows: tuple[Grade, ...]
+    rows: tuple[RecordingGrade, ...]
     mean: TrackMetrics
     """Over the recordings, each counting the same; the calibration is of all their points together."""
 
@@ -92,20 +90,32 @@ class Grades:
         }
 
 
-def grade(
+def grade_tracker(
     recordings: Sequence[Path],
     tracker: Tracker,
     chunks: ChunkSettings,
     lifting: LiftSettings,
     metrics: MetricSettings = MetricSettings(),
-    report: Callable[[Grade], None] = lambda _: None,
-) -> Grades:
-    """Grade every recording; ``report`` is told of each as it is done."""
+    report: Callable[[RecordingGrade], None] = lambda _: None,
+) -> TrackerGrade:
+    """Label recordings whose truth is known by one tracker, and compare.
+
+    Args:
+        recordings: Folders with a ``ground_truth.npz``.
+        tracker: Who follows the points.
+        chunks: How a clip is cut for it.
+        lifting: How its tracks become 3D.
+        metrics: By which rules errors are counted.
+        report: Is told of each recording as it is done.
+
+    Raises:
+        DataError: A recording cannot be read, or its truth is missing or of other pictures.
+    """
     rows = []
     for recording in recordings:
         rows.append(grade_recording(recording, tracker, chunks, lifting, metrics))
         report(rows[-1])
-    return Grades(tracker.describe(), tuple(rows), average([r.metrics for r in rows], _calibration(rows)))
+    return TrackerGrade(tracker.describe(), tuple(rows), average([r.metrics for r in rows], _calibration(rows)))
 
 
 def grade_recording(
@@ -114,18 +124,15 @@ def grade_recording(
     chunks: ChunkSettings,
     lifting: LiftSettings,
     metrics: MetricSettings = MetricSettings(),
-) -> Grade:
-    """Label the true tracks' query pixels, given nothing but the pictures, and compare.
-
-    Raises :class:`DataError` where the recording's truth is missing, or is of other pictures.
-    """
+) -> RecordingGrade:
+    """Label the true tracks' query pixels, given nothing but the pictures, and compare; see :func:`grade_tracker`."""
     truth = ground_truth.read(recording)
     clip = read_clip(recording)
     _check_same(recording, clip, truth)
     start = time.process_time()
     estimate = label_blind(clip, truth.query_px, tracker, chunks, lifting)
     cpu_s = time.process_time() - start
-    return Grade(
+    return RecordingGrade(
         recording=recording.name,
         frames=len(clip),
         queries=len(truth.query_px),
@@ -152,11 +159,11 @@ def label_blind(
     tracker: Tracker,
     chunks: ChunkSettings,
     lifting: LiftSettings,
-) -> Estimate:
+) -> EstimatedTracks:
     """The labeling's answer for pixels of the first frame, in the camera frame."""
     _, tracks = label_clip(clip, query_px, tracker, chunks, lifting)
     xyz_cam = apply(inverse(clip.camera.T_world_cam), tracks.xyz_world.astype(np.float64)).astype(np.float32)
-    return Estimate(xyz_cam, tracks.visible, None if tracks.quality is None else tracks.quality.sigma)
+    return EstimatedTracks(xyz_cam, tracks.visible, None if tracks.quality is None else tracks.quality.sigma)
 
 
 def _check_same(recording: Path, clip: Clip, truth: GroundTruth) -> None:
@@ -175,7 +182,7 @@ def _check_same(recording: Path, clip: Clip, truth: GroundTruth) -> None:
         )
 
 
-def _calibration(rows: Sequence[Grade]) -> Calibration | None:
+def _calibration(rows: Sequence[RecordingGrade]) -> Calibration | None:
     """Of the points of all recordings together."""
     stated = [(errors_m(r.estimate, r.truth), r.estimate.sigma) for r in rows if r.estimate.sigma is not None]
     if not stated:

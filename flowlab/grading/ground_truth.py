@@ -10,8 +10,12 @@ from jaxtyping import Bool, Float32, Int8
 from numpy.lib.npyio import NpzFile
 
 from flowlab.errors import DataError
+from flowlab.files import read_json
+from flowlab.text import natural_key
 
 FILE_NAME = "ground_truth.npz"
+MADE_WITH = "simulated.json"
+"""In a simulated recording's folder: what it was made with, and how many queries could not be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +43,34 @@ def has_ground_truth(recording: Path) -> bool:
     return (recording / FILE_NAME).is_file()
 
 
+def find_with_truth(path: Path) -> list[Path]:
+    """The recordings with known truth at or below a path, in natural order.
+
+    Raises:
+        DataError: There is no such folder, or no such recording.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: there is no such folder")
+    found = sorted((file.parent for file in path.rglob(FILE_NAME)), key=lambda folder: natural_key(str(folder)))
+    if not found:
+        raise DataError(
+            f"{path}: no recording at or below it has a {FILE_NAME}, so its truth is not known (see docs/grading.md); "
+            "without recordings of your own, give --tasks hammer,door-open"
+        )
+    return found
+
+
+def unusable_queries(recording: Path) -> int:
+    """How many queries were left out of a simulated recording; 0 for any other."""
+    made = recording / MADE_WITH
+    return int(read_json(made)["unusable_queries"]) if made.is_file() else 0
+
+
 def read(path: Path) -> GroundTruth:
     """True tracks from a recording's folder, or from the file itself.
 
-    Raises :class:`DataError` where there is no such file, or it does not hold what it should.
+    Raises:
+        DataError: There is no such file, or it does not hold what it should.
     """
     path = path / FILE_NAME if path.is_dir() else path
     try:

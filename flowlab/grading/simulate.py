@@ -11,20 +11,18 @@ from jaxtyping import Int
 from pydantic import Field
 
 from flowlab.config import Settings
-from flowlab.errors import DataError
+from flowlab.errors import DataError, unknown_name
 from flowlab.files import read_json, temporary_path, write_json
-from flowlab.grading.ground_truth import GroundTruth
+from flowlab.grading.ground_truth import MADE_WITH, GroundTruth
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import EdgeSettings, QuerySettings, away_from_edges, sample_queries
 from flowlab.pipeline.stages.simulation import ExpertStage
 from flowlab.recordings.writing import write_rgbd_recording
 from flowlab.records import Frame, Role
-from flowlab.sim.sensor import KINECT, Sensor, SensorSettings
+from flowlab.sim.sensor import KINECT, PRESETS, Sensor, SensorSettings
 from flowlab.sim.simulation import CameraSettings, SceneSettings
 from flowlab.sim.surface_tracks import surface_tracks
 
-MADE_WITH = "simulated.json"
-"""In a simulated recording's folder: what it was made with, and how many queries could not be used."""
 UNUSABLE_M = 0.005
 """A query whose sensor depth in the first frame is farther than this from the true surface is not graded:
 what the labeling would follow there is another point than the one whose truth is known."""
@@ -60,12 +58,41 @@ class SimulatedRecording(Settings):
     queries: QueryMix = QueryMix()
     """Which points have their truth recorded."""
 
+    @classmethod
+    def with_camera(cls, sensor: str, size: tuple[int, int]) -> "SimulatedRecording":
+        """The defaults with another camera.
+
+        Args:
+            sensor: Name of a preset of its errors, ``kinect`` or ``clean``.
+            size: Width and height of its pictures [px].
+
+        Raises:
+            UsageError: There is no such preset.
+        """
+        if sensor not in PRESETS:
+            raise unknown_name("sensor", sensor, PRESETS)
+        default = cls(sensor=PRESETS[sensor])
+        scene = default.expert.scene
+        camera = scene.camera.model_copy(update={"width": size[0], "height": size[1]})
+        expert = default.expert.model_copy(update={"scene": scene.model_copy(update={"camera": camera})})
+        return default.model_copy(update={"expert": expert})
+
 
 def simulate_recording(folder: Path, task: str, seed: int, settings: SimulatedRecording) -> bool:
-    """Record the expert's attempt at (task, seed) into a plain folder with ``ground_truth.npz``.
+    """Record the expert's attempt at a task into a plain folder with ``ground_truth.npz``.
 
-    A folder that was made like this with the same settings is left alone, and the answer is False; one made
-    with others is replaced. Any other folder in the way raises :class:`DataError`.
+    Args:
+        folder: Where to. One that was made like this with the same settings is left alone, one made with others is
+            replaced.
+        task: A task of MetaWorld.
+        seed: Of the scene, and of the sensor's errors.
+        settings: How it is recorded.
+
+    Returns:
+        Whether it was recorded now.
+
+    Raises:
+        DataError: Something else is in the way, or there is no point to grade.
     """
     made_with = {"task": task, "seed": seed, "settings": json.loads(settings.model_dump_json())}
     if folder.exists():
@@ -137,16 +164,11 @@ def choose_pixels(first: Frame, task: str, settings: SimulatedRecording) -> Int[
         if count > 0 and kind.any():
             part = replace(cloud, xyz_world=cloud.xyz_world[kind], pixel=cloud.pixel[kind], owner=cloud.owner[kind])
             queries = sample_queries(part, QuerySettings(points=count))
-            chosen.append(queries.xyz_world[: queries.count])
+            assert queries.pixel is not None
+            chosen.append(queries.pixel[: queries.count])
     if not chosen:
         raise DataError(f"{task}: no point of the first frame lies in the crop; set observer.crop")
-    uv, _ = first.camera.project(np.concatenate(chosen))
-    pixel = np.rint(uv).astype(np.int64)
+    v, u = np.divmod(np.concatenate(chosen).astype(np.int64), first.camera.width)
+    pixel = np.stack([u, v], -1)
     _, where = np.unique(pixel, axis=0, return_index=True)
     return pixel[np.sort(where)]
-
-
-def unusable_queries(recording: Path) -> int:
-    """How many queries were left out of a simulated recording; 0 for any other."""
-    made = recording / MADE_WITH
-    return int(read_json(made)["unusable_queries"]) if made.is_file() else 0

@@ -1,4 +1,4 @@
-"""Clearing the cloud of a real scene of its table and of stray points."""
+"""Clearing the cloud of a real scene of its table and of outliers."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ class TableSettings(Settings):
 
 
 class OutlierSettings(Settings):
-    """A stray point is farther from its neighbors than is usual in its cloud."""
+    """An outlier is farther from its neighbors than is usual in its cloud."""
 
     neighbors: int = Field(default=20, gt=0)
     """Nearest neighbors whose mean distance is looked at."""
@@ -35,28 +35,48 @@ class OutlierSettings(Settings):
     """How many standard deviations that may lie above the cloud's mean."""
 
 
-def above_table(
+def table_mask(
     xyz_world: Float[np.ndarray, "P 3"], eye_world: Float[np.ndarray, "3"], settings: TableSettings
 ) -> Bool[np.ndarray, "P"]:
-    """Which points lie above the largest plane: on the camera's side of it, and not in it."""
-    everything = np.ones(len(xyz_world), bool)
+    """Which points belong to the largest plane, or lie behind it as the camera sees it.
+
+    Args:
+        xyz_world: The cloud [m].
+        eye_world: Where the camera is [m]; points on its side of the plane are above the table.
+        settings: How a plane is found, and what belongs to it.
+
+    Returns:
+        True where a point is the table or below it; nowhere, if no plane holds enough points to be a table.
+
+    Raises:
+        MissingLibraryError: Open3D cannot be loaded.
+    """
+    nothing = np.zeros(len(xyz_world), bool)
     if len(xyz_world) < 3:
-        return everything
+        return nothing
     open3d = _open3d()
     open3d.utility.random.seed(settings.seed)
     (*normal, offset), inside = _cloud(xyz_world).segment_plane(settings.distance_m, 3, settings.trials)
     if len(inside) < settings.min_share * len(xyz_world):
-        return everything
+        return nothing
     height = xyz_world @ np.array(normal) + offset
-    return height * np.sign(eye_world @ np.array(normal) + offset) > settings.distance_m
+    return ~(height * np.sign(eye_world @ np.array(normal) + offset) > settings.distance_m)
 
 
-def not_stray(xyz_world: Float[np.ndarray, "P 3"], settings: OutlierSettings) -> Bool[np.ndarray, "P"]:
-    """Which points are not stray."""
-    kept = np.zeros(len(xyz_world), bool)
+def outlier_mask(xyz_world: Float[np.ndarray, "P 3"], settings: OutlierSettings) -> Bool[np.ndarray, "P"]:
+    """Which points are outliers: farther from their neighbors than is usual in their cloud.
+
+    Args:
+        xyz_world: The cloud [m].
+        settings: How many neighbors, and how far is unusual.
+
+    Raises:
+        MissingLibraryError: Open3D cannot be loaded.
+    """
+    outlier = np.ones(len(xyz_world), bool)
     if len(xyz_world):
-        kept[_cloud(xyz_world).remove_statistical_outlier(settings.neighbors, settings.std_ratio)[1]] = True
-    return kept
+        outlier[_cloud(xyz_world).remove_statistical_outlier(settings.neighbors, settings.std_ratio)[1]] = False
+    return outlier
 
 
 def _cloud(xyz_world: np.ndarray) -> Any:
@@ -70,7 +90,7 @@ def _open3d() -> Any:
         import open3d
     except (ImportError, OSError) as error:
         raise MissingLibraryError(
-            f"removing tables and stray points needs Open3D, which cannot be loaded ({error}); install what it asks "
+            f"removing tables and outliers needs Open3D, which cannot be loaded ({error}); install what it asks "
             "for with 'apt-get install libusb-1.0-0', or set observer.remove_table and observer.remove_outliers to null"
         ) from error
     return open3d

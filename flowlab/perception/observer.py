@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
-from flowlab.perception.cleaning import SWITCH, OutlierSettings, TableSettings, above_table, not_stray
+from flowlab.perception.cleaning import SWITCH, OutlierSettings, TableSettings, outlier_mask, table_mask
 from flowlab.records import Cloud, Entity, Frame, Observation, Role
 
 Vector3 = tuple[float, float, float]
@@ -47,7 +47,7 @@ class ObserverSettings(Settings):
     remove_table: Annotated[TableSettings | None, SWITCH] = None
     """Remove the largest plane in the crop and what lies below it; null keeps it."""
     remove_outliers: Annotated[OutlierSettings | None, SWITCH] = None
-    """Then remove stray points; null keeps them."""
+    """Then remove outliers; null keeps them."""
 
     def crop_for(self, task: str) -> Box:
         """The workspace of a task."""
@@ -76,10 +76,10 @@ class Observer:
             frame.depth, owner, self._kept_owners(frame.entities), cam.K, cam.T_world_cam, self._low, self._high
         )
         if self.settings.remove_table is not None:
-            kept = above_table(xyz, cam.T_world_cam[:3, 3], self.settings.remove_table)
+            kept = ~table_mask(xyz, cam.T_world_cam[:3, 3], self.settings.remove_table)
             xyz, pixel = xyz[kept], pixel[kept]
         if self.settings.remove_outliers is not None:
-            kept = not_stray(xyz, self.settings.remove_outliers)
+            kept = ~outlier_mask(xyz, self.settings.remove_outliers)
             xyz, pixel = xyz[kept], pixel[kept]
         return Cloud(xyz, pixel, None if frame.owner is None else owner.reshape(-1)[pixel], frame.entities)
 

@@ -64,7 +64,7 @@ def sample_queries(cloud: Cloud, settings: QuerySettings) -> Queries:
         raise DataError(f"no point to follow: the first frame shows nothing for '{settings.sampling}' queries")
     owner = np.full(len(cloud.xyz_world), -1, np.int16) if cloud.owner is None else cloud.owner
     filled = pad(index, settings.points)
-    return Queries(cloud.xyz_world[filled], owner[filled], len(index), cloud.entities)
+    return Queries(cloud.xyz_world[filled], owner[filled], len(index), cloud.entities, cloud.pixel[filled])
 
 
 def away_from_edges(cloud: Cloud, depth: Float32[np.ndarray, "H W"], settings: EdgeSettings) -> Cloud:

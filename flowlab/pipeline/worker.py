@@ -15,9 +15,19 @@ from flowlab.storage.manifest import Receipt, Reject
 from flowlab.storage.shard import episode_digest
 
 
-def run_unit(recipe_json: str, settings_digest: str, folder: Path, unit: WorkUnit) -> Receipt:
-    """Make the episodes of a unit, write them into its shard, and its receipt beside them."""
-    pipeline = _pipeline(recipe_json)
+def run_unit(
+    recipe_json: str, stages_folder: Path | None, settings_digest: str, folder: Path, unit: WorkUnit
+) -> Receipt:
+    """Make the episodes of a unit, write them into its shard, and its receipt beside them.
+
+    Args:
+        recipe_json: The recipe, as JSON.
+        stages_folder: Where the modules of its own stages may lie.
+        settings_digest: Identifies its settings; the shard says it.
+        folder: Of the dataset.
+        unit: What is to be made.
+    """
+    pipeline = _pipeline(recipe_json, stages_folder)
     before = dict(pipeline.tallies)
     episodes: list[Episode] = []
     rejects: list[Reject] = []
@@ -60,5 +70,5 @@ def _store(pipeline: Pipeline, path: Path, episodes: list[Episode], settings_dig
 
 
 @lru_cache(maxsize=1)
-def _pipeline(recipe_json: str) -> Pipeline:
-    return parse_recipe(recipe_json, "recipe").pipeline()
+def _pipeline(recipe_json: str, stages_folder: Path | None) -> Pipeline:
+    return parse_recipe(recipe_json, "recipe", folder=stages_folder).pipeline()

@@ -47,7 +47,7 @@ def migrate_policy(values: Any) -> Any:
     if not isinstance(values.get("policy"), dict):
         return {**moved, "format": FORMAT}  # whoever reads it says what is wrong
     spec = _renamed(values["policy"], _SPEC)
-    spec["settings"] = _settings(spec.get("settings"))
+    spec["settings"] = migrate_settings(spec.get("settings"))
     spec["channels"] = _renamed(spec.get("channels"), _CHANNELS)
     spec["normalizer"] = _normalizer(spec.get("normalizer"), spec["settings"])
     if isinstance(observer := spec.get("observer"), dict):
@@ -68,7 +68,7 @@ def _renamed(values: Any, names: Mapping[str, str]) -> Any:
     return {names.get(k, k): v for k, v in values.items()} if isinstance(values, dict) else values
 
 
-def _settings(values: Any) -> Any:
+def migrate_settings(values: Any) -> Any:
     """Each policy's own: a motion was among the settings of all of them."""
     if not isinstance(values, dict):
         return values

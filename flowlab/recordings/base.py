@@ -1,19 +1,20 @@
 """What a reader is: it recognizes one layout of recordings, and gives its streams as they are."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from functools import cache
 from pathlib import Path
 from typing import ClassVar, Protocol
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from flowlab.errors import DataError, UsageError, unknown_name
+from flowlab.errors import DataError, UsageError, first_line
 from flowlab.recordings.metadata import Metadata
+from flowlab.registry import READERS, Plugin
 
-GROUP = "flowlab.readers"
-"""Entry-point group in which a package offers readers of its own."""
+_LOG = logging.getLogger(__name__)
 
 
 class BadImage(Exception):
@@ -63,49 +64,106 @@ class Streams:
 
 
 class Reader(Protocol):
-    """Reads one layout."""
+    """Reads one layout of recordings. A reader has no settings: its class is called without arguments."""
 
     name: ClassVar[str]
-    looks_for: ClassVar[str]
+    expects: ClassVar[str]
     """What a recording of this layout looks like, in a few words."""
-    general: ClassVar[bool]
-    """Whether other layouts may look like this one too, so that they are asked first."""
+    fallback: ClassVar[bool]
+    """Whether recordings of other layouts may look like this one too, so that their readers win."""
 
     def probe(self, path: Path) -> bool:
         """Whether this is a recording of the layout; looks at names, hardly at content."""
         ...
 
     def read(self, path: Path, given: Metadata) -> Streams:
-        """The streams. ``given`` is what the user says of the recording. Raises :class:`DataError`."""
+        """Find the streams of a recording; no picture is decoded yet.
+
+        Args:
+            path: The recording, a folder or a file. Nothing outside it, or beside it if it is a file, is read.
+            given: What the user says of the recording.
+
+        Raises:
+            DataError: The recording is damaged, or what it does not tell itself was not given.
+        """
         ...
 
 
-def load_readers() -> tuple[Reader, ...]:
-    """Every installed reader, in the order in which they are asked."""
-    readers = [entry.load()() for entry in entry_points(group=GROUP)]
-    return tuple(sorted(readers, key=lambda r: (r.general, r.name)))
+def load_readers(name: str | None = None) -> tuple[Reader, ...]:
+    """Every installed reader, in the order in which they are asked.
+
+    A reader of another package that cannot be imported is left out, and a warning says so: the recordings of the
+    other layouts can be read without it.
+
+    Args:
+        name: An import path ``module:Class`` of one more.
+
+    Raises:
+        UsageError: There is no reader at that import path.
+    """
+    readers = [reader for plugin in READERS.plugins().values() if (reader := _load_installed(plugin)) is not None]
+    if name is not None and ":" in name:
+        readers.append(READERS.load(name)())
+    return tuple(sorted(readers, key=lambda r: (r.fallback, r.name)))
 
 
 def choose_reader(path: Path, name: str | None = None) -> Reader:
-    """The reader of that name, else the one that recognizes the recording."""
-    readers = load_readers()
+    """The reader of a recording.
+
+    Args:
+        path: The recording.
+        name: An installed reader or an import path ``module:Class``; else the one that recognizes the recording.
+
+    Raises:
+        UsageError: There is no such file or reader, or several readers recognize the recording.
+        DataError: No reader recognizes it.
+    """
     if name is not None:
-        found = [r for r in readers if r.name == name]
-        if not found:
-            raise unknown_name("reader", name, (r.name for r in readers))
-        return found[0]
+        reader: Reader = READERS.load(name)()
+        return reader
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or folder")
-    able = [r for r in readers if r.probe(path)]
-    special = [r for r in able if not r.general]
+    readers = load_readers()
+    able = [r for r in readers if recognizes(r, path)]
+    special = [r for r in able if not r.fallback]
     if len(special) > 1:
         names = " and ".join(r.name for r in special)
-        raise UsageError(f"{path}: the readers {names} both recognize it; choose one with the setting 'reader'")
+        raise UsageError(f"{path}: the readers {names} both recognize it; choose one with --reader or the setting "
+                         "recording.reader")  # fmt: skip
     if not able:
-        raise DataError(f"{path}: not a recording flowlab knows; looked for {what_is_looked_for(readers)}")
+        raise DataError(f"{path}: not a recording flowlab knows; looked for {expected_layouts(readers)}")
     return able[0]
 
 
-def what_is_looked_for(readers: tuple[Reader, ...]) -> str:
+def recognizes(reader: Reader, path: Path) -> bool:
+    """Whether a reader recognizes a recording; one that fails does not, and a warning says so."""
+    try:
+        return bool(reader.probe(path))
+    except Exception as error:  # whatever somebody's package does
+        if type(reader).__module__.startswith("flowlab."):
+            raise
+        _warn_once(f"reader '{reader.name}': fails on {path} ({first_line(error)}); it is not asked")
+        return False
+
+
+def expected_layouts(readers: tuple[Reader, ...]) -> str:
     """All layouts in one phrase, the general one first."""
-    return "; ".join(f"{r.looks_for} ({r.name})" for r in sorted(readers, key=lambda r: not r.general))
+    return "; ".join(f"{r.expects} ({r.name})" for r in sorted(readers, key=lambda r: not r.fallback))
+
+
+def _load_installed(plugin: Plugin) -> Reader | None:
+    try:
+        reader: Reader = READERS.load(plugin.name)()
+        return reader
+    except UsageError as error:
+        _warn_once(f"{error}; it is left out")
+    except Exception as error:  # whatever somebody's class does
+        if plugin.package.startswith("flowlab "):
+            raise
+        _warn_once(f"reader '{plugin.name}' of {plugin.package}: cannot be made ({first_line(error)}); it is left out")
+    return None
+
+
+@cache
+def _warn_once(sentence: str) -> None:
+    _LOG.warning("flowlab: %s", sentence)

@@ -9,10 +9,10 @@ from jaxtyping import Float64
 
 from flowlab.errors import DataError
 from flowlab.recordings.frame_check import BadFrame
-from flowlab.recordings.imaging import Size
+from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.metadata import Metadata
-from flowlab.recordings.parsed import RecordingSettings, recognize
-from flowlab.recordings.timing import gaps, rate
+from flowlab.recordings.parsing import RecordingSettings, parse_recording
+from flowlab.recordings.sync import find_gaps, sampling_rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class StreamInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Description:
+class RecordingDescription:
     """What was recognized of a recording."""
 
     path: Path
@@ -60,12 +60,12 @@ class Description:
     """Why it cannot be opened as it is; None where it can."""
 
 
-def describe(path: Path, settings: RecordingSettings) -> Description:
+def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
     """What is recognized of a recording, even where it cannot be opened for want of calibration."""
-    source = recognize(Path(path), settings)
-    seen, streams, problem, frame_size = source.survey, source.streams, None, None
+    source = parse_recording(Path(path), settings)
+    seen, streams, problem, frame_size = source.frame_check, source.streams, None, None
     try:
-        camera = source.imaging(settings).camera
+        camera = source.frame_processor(settings).camera
         frame_size = camera.width, camera.height
         source.check_bad_frames(settings)
     except DataError as error:
@@ -74,7 +74,7 @@ def describe(path: Path, settings: RecordingSettings) -> Description:
     start = streams.color.time_s[0]
     named = [("color", streams.color.time_s), ("depth", streams.depth.time_s)]
     named += [(s.name, s.time_s) for s in (*streams.state, *streams.action)]
-    return Description(
+    return RecordingDescription(
         path=source.path,
         reader=source.reader.name,
         task=source.metadata.task,
@@ -96,4 +96,4 @@ def describe(path: Path, settings: RecordingSettings) -> Description:
 
 
 def _info(name: str, time_s: Float64[np.ndarray, "N"]) -> StreamInfo:
-    return StreamInfo(name, len(time_s), rate(time_s), float(time_s[0]), float(time_s[-1]), gaps(time_s))
+    return StreamInfo(name, len(time_s), sampling_rate(time_s), float(time_s[0]), float(time_s[-1]), find_gaps(time_s))

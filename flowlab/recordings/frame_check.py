@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
-from flowlab.recordings.imaging import Size
-from flowlab.recordings.timing import nearest
+from flowlab.recordings.frame_processing import Size
+from flowlab.recordings.sync import nearest_sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class BadFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Survey:
+class FrameCheck:
     """What was found by decoding every picture once."""
 
     color: Int64[np.ndarray, "T"]
@@ -41,7 +41,7 @@ class Survey:
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class _ImageCheck:
     """What decoding one picture told."""
 
     size: Size
@@ -50,9 +50,9 @@ class _Look:
     median: float = 0.0
 
 
-def survey(
+def check_frames(
     streams: Streams, *, every: int, start_s: float, stop_s: float | None, max_sync_s: float, max_state_s: float
-) -> Survey:
+) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
@@ -61,9 +61,9 @@ def survey(
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
-    match = nearest(clock, streams.depth.time_s)
+    match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
-    off_state = {s.name: np.abs(s.time_s[nearest(clock, s.time_s)] - clock) for s in streams.state}
+    off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
     color = {int(i): _look(streams.color, int(i), _look_at_color) for i in frames}
     depth = {int(i): _look(streams.depth, int(i), _look_at_depth) for i in np.unique(match[off <= max_sync_s])}
     color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
@@ -85,7 +85,7 @@ def survey(
     rows = np.array(good, np.int64).reshape(-1, 2)
     median = depth[good[0][1]].median if good else 0.0
     sync = {"depth": off, **off_state}
-    return Survey(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync)
+    return FrameCheck(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync)
 
 
 def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | None) -> Int64[np.ndarray, "F"]:
@@ -93,33 +93,33 @@ def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | No
     return np.flatnonzero((since >= start_s) & (since <= (np.inf if stop_s is None else stop_s)))[::every]
 
 
-def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _Look]) -> _Look:
+def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageCheck]) -> _ImageCheck:
     try:
         return judge(stream.read(index))
     except BadImage as error:
-        return _Look((0, 0), str(error))
+        return _ImageCheck((0, 0), str(error))
 
 
-def _look_at_color(picture: np.ndarray) -> _Look:
-    return _Look((picture.shape[1], picture.shape[0]))
+def _look_at_color(picture: np.ndarray) -> _ImageCheck:
+    return _ImageCheck((picture.shape[1], picture.shape[0]))
 
 
-def _look_at_depth(counts: np.ndarray) -> _Look:
+def _look_at_depth(counts: np.ndarray) -> _ImageCheck:
     readings = counts[counts > 0]
     readings = readings[np.isfinite(readings)]
     size = counts.shape[1], counts.shape[0]
     if not readings.size:
-        return _Look(size, "has no depth reading at all")
-    return _Look(size, median=float(np.median(readings[:: max(1, readings.size // 4096)])))
+        return _ImageCheck(size, "has no depth reading at all")
+    return _ImageCheck(size, median=float(np.median(readings[:: max(1, readings.size // 4096)])))
 
 
-def _usual_size(needs_frame: Iterable[_Look]) -> Size:
+def _usual_size(needs_frame: Iterable[_ImageCheck]) -> Size:
     """The most frequent size of pictures that could be decoded."""
     sizes = Counter(look.size for look in needs_frame if look.size != (0, 0))
     return sizes.most_common(1)[0][0] if sizes else (0, 0)
 
 
-def _fault(name: str, look: _Look, usual: Size) -> BadFrame | None:
+def _fault(name: str, look: _ImageCheck, usual: Size) -> BadFrame | None:
     if look.reason:
         return BadFrame(name, look.reason)
     if look.size != usual:
@@ -138,7 +138,7 @@ def _ms(seconds: float) -> str:
     return f"{1000 * seconds:.0f} ms"
 
 
-def side_by_side(
+def align_samples(
     samples: tuple[SampleStream, ...],
     clock: Float64[np.ndarray, "T"],
     pick: Callable[[np.ndarray, np.ndarray], np.ndarray],

@@ -1,6 +1,5 @@
 """Picture files: lists of them, and decoding that notices damage."""
 
-import re
 import zlib
 from collections.abc import Sequence
 from functools import partial
@@ -8,24 +7,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Num, Shaped, UInt8
 
 from flowlab.recordings.base import BadImage, ImageStream
+from flowlab.text import natural_key
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def natural_order(name: str) -> list[tuple[int, int | str]]:
-    """Sort key that puts ``frame2`` before ``frame10``."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
-
-
 def list_images(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     """The pictures of a folder in natural order; hidden files are no pictures."""
     found = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".")]
-    return sorted(found, key=lambda f: natural_order(f.name))
+    return sorted(found, key=lambda f: natural_key(f.name))
 
 
 def color_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"]) -> ImageStream:
@@ -61,13 +56,17 @@ def decode_color(content: bytes) -> UInt8[np.ndarray, "H W 3"]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def decode_depth(content: bytes) -> np.ndarray:
+def decode_depth(content: bytes) -> Num[np.ndarray, "H W"]:
     """Counts (H, W) of an encoded depth picture."""
     return check_depth(_decode(content, cv2.IMREAD_UNCHANGED))
 
 
-def check_depth(counts: np.ndarray) -> np.ndarray:
-    """The same counts (H, W), where they can be depth: one channel of 16 bits or more."""
+def check_depth(counts: Shaped[np.ndarray, "..."]) -> Num[np.ndarray, "H W"]:
+    """The same counts, without an axis of one channel.
+
+    Raises:
+        BadImage: They cannot be depth, which is one channel of 16 bits or more.
+    """
     if counts.ndim == 3 and 1 in (counts.shape[0], counts.shape[-1]):
         counts = counts.reshape(counts.shape[:-1] if counts.shape[-1] == 1 else counts.shape[1:])
     if counts.ndim != 2:

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from flowlab.errors import DataError, UsageError
-from flowlab.recordings.base import BadImage, Reader, Streams, load_readers, what_is_looked_for
-from flowlab.recordings.description import Description, StreamInfo, describe
-from flowlab.recordings.frame_check import Survey
-from flowlab.recordings.image_files import natural_order
-from flowlab.recordings.imaging import Imaging
-from flowlab.recordings.parsed import ParsedRecording, RecordingSettings, Rows, recognize
-from flowlab.recordings.timing import gaps
+from flowlab.recordings.base import BadImage, Reader, Streams, expected_layouts, load_readers, recognizes
+from flowlab.recordings.description import RecordingDescription, StreamInfo, describe
+from flowlab.recordings.frame_check import FrameCheck
+from flowlab.recordings.frame_processing import FrameProcessor
+from flowlab.recordings.parsing import AlignedSamples, ParsedRecording, RecordingSettings, parse_recording
+from flowlab.recordings.sync import find_gaps
 from flowlab.records import Demonstration, Frame
+from flowlab.text import natural_key
 
 __all__ = [
-    "Description",
     "Recording",
+    "RecordingDescription",
     "RecordingSettings",
     "StreamInfo",
     "describe",
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Recording(Demonstration):
     """A recording of a real robot. Row t is a color picture, with the depth picture nearest in time.
 
@@ -37,45 +37,54 @@ class Recording(Demonstration):
 
     path: Path
     streams: Streams
-    imaging: Imaging
-    survey: Survey
+    processor: FrameProcessor
+    frame_check: FrameCheck
 
     def frame(self, t: int) -> Frame:
         """Decode the pictures of row t: depth float32 [m] seen from the color camera, and color."""
         try:
-            rgb = self.streams.color.read(int(self.survey.color[t]))
-            counts = self.streams.depth.read(int(self.survey.depth[t]))
+            rgb = self.streams.color.read(int(self.frame_check.color[t]))
+            counts = self.streams.depth.read(int(self.frame_check.depth[t]))
         except BadImage as error:
             raise DataError(f"{self.path}: row {t} could be read when it was opened, and now it {error}") from error
-        return Frame(self.imaging.depth(counts), self.camera, rgb=self.imaging.color(rgb))
+        return Frame(self.processor.depth(counts), self.camera, rgb=self.processor.color(rgb))
 
 
-def find_recordings(paths: Sequence[Path]) -> list[Path]:
-    """Every recording at or below the given files and folders, in natural order, each once.
+def find_recordings(paths: Sequence[Path], reader: str | None = None) -> list[Path]:
+    """Every recording at or below some files and folders.
 
-    Raises :class:`UsageError` that says what was looked for where a path has none.
+    Args:
+        paths: Where to look. Links and hidden files below them are passed over.
+        reader: Import path ``module:Class`` of a reader to ask besides the installed ones; an installed one's name
+            changes nothing.
+
+    Returns:
+        The recordings, in natural order, each once.
+
+    Raises:
+        UsageError: A path does not exist or has no recording; the message says what was looked for.
     """
-    readers = load_readers()
+    readers = load_readers(reader)
     found: dict[Path, None] = {}
     for path in map(Path, paths):
         if not path.exists():
             raise UsageError(f"{path}: there is no such file or folder")
         below = list(_below(path, readers))
         if not below:
-            raise UsageError(f"{path}: no recording at or below it; looked for {what_is_looked_for(readers)}")
+            raise UsageError(f"{path}: no recording at or below it; looked for {expected_layouts(readers)}")
         found.update(dict.fromkeys(below))
     return list(found)
 
 
 def _below(path: Path, readers: tuple[Reader, ...]) -> Iterator[Path]:
-    if any(r.probe(path) for r in readers):
+    if any(recognizes(r, path) for r in readers):
         yield path
     elif path.is_dir():
         try:
             inside = [p for p in path.iterdir() if not p.name.startswith(".") and not p.is_symlink()]
         except OSError as error:
             raise UsageError(f"{path}: cannot be looked into ({error.strerror})") from error
-        for p in sorted(inside, key=lambda p: natural_order(p.name)):
+        for p in sorted(inside, key=lambda p: natural_key(p.name)):
             yield from _below(p, readers)
 
 
@@ -86,8 +95,8 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     where state was not either, both are (T, 0). ``success`` holds on the last row only. Raises
     :class:`DataError` with one sentence where it cannot be opened.
     """
-    source = recognize(Path(path), settings)
-    imaging = source.imaging(settings)
+    source = parse_recording(Path(path), settings)
+    processor = source.frame_processor(settings)
     source.check_bad_frames(settings)
     rows = source.rows()
     success = np.zeros(len(rows.clock_s), bool)
@@ -95,18 +104,18 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     recording = Recording(
         task=task,
         seed=seed,
-        camera=imaging.camera,
+        camera=processor.camera,
         time_s=rows.clock_s - rows.clock_s[0],
         state=rows.state,
         action=rows.action,
         success=success,
-        extras=_extras(source, imaging, rows),
+        extras=_extras(source, processor, rows),
         path=source.path,
         streams=source.streams,
-        imaging=imaging,
-        survey=source.survey,
+        processor=processor,
+        frame_check=source.frame_check,
     )
-    if imaging.registration is not None and not recording.frame(0).depth.any():
+    if processor.registration is not None and not recording.frame(0).depth.any():
         raise DataError(
             f"{path}: with this T_color_depth no depth reading lies in the color picture; it must map coordinates "
             f"of the depth camera to the color camera, in meters; correct it in {source.write_to}"
@@ -114,24 +123,24 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     return recording
 
 
-def _extras(source: ParsedRecording, imaging: Imaging, rows: Rows) -> dict[str, Any]:
+def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSamples) -> dict[str, Any]:
     """Where a recording comes from, as JSON values."""
-    seen, streams = source.survey, source.streams
-    depth = "registered to color by flowlab" if imaging.registration is not None else "registered to color"
-    if imaging.registration is None and streams.registered is None:
+    seen, streams = source.frame_check, source.streams
+    depth = "registered to color by flowlab" if processor.registration is not None else "registered to color"
+    if processor.registration is None and streams.registered is None:
         depth = "taken as registered to color: same size, nothing said"
     return {
         "source": source.path.name if source.path.is_absolute() else source.path.as_posix(),
         "reader": source.reader.name,
         "frames": {"color": len(streams.color), "depth": len(streams.depth), "looked_at": seen.looked_at},
         "bad_frames": [[b.name, b.reason] for b in seen.bad],
-        "gaps_s": [list(gap) for gap in gaps(rows.clock_s - rows.clock_s[0])],
+        "gaps_s": [list(gap) for gap in find_gaps(rows.clock_s - rows.clock_s[0])],
         "max_sync_error_s": {k: float(off.max()) for k, off in seen.sync_s.items() if len(off)},
         "depth": depth,
-        "depth_unit_m": imaging.depth_unit_m,
-        "shrunk_by": imaging.factor,
+        "depth_unit_m": processor.depth_unit_m,
+        "shrunk_by": processor.factor,
         "origin": dict(sorted(source.origin.items())),
         "world": "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame",
-        "action": rows.action_is,
+        "action": rows.action_source,
         "notes": list(streams.notes),
     }

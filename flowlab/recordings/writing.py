@@ -1,7 +1,5 @@
 """Writing a recording as a plain folder, whole or not at all."""
 
-import os
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,11 @@ import yaml
 from jaxtyping import Bool, Float, Float32, Int8, UInt8
 
 from flowlab.errors import DataError
+from flowlab.files import new_folder
 from flowlab.geometry.camera import Camera
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics
 
-MOST = np.iinfo(np.uint16).max
+_MAX_COUNT = np.iinfo(np.uint16).max
 
 
 def write_rgbd_recording(
@@ -35,36 +34,45 @@ def write_rgbd_recording(
     visible: Bool[np.ndarray, "T N"] | None = None,
     role: Int8[np.ndarray, "N"] | None = None,
 ) -> None:
-    """Write frames (depth in meters, 0 or not finite where there is no reading) as a recording.
+    """Write frames as a plain folder, which the reader ``plain`` reads back exactly, depth to its unit.
 
-    Depth is rounded to ``depth_unit_m``, so 0.0001 holds 6.5 m at a tenth of a millimeter; a reading too far
-    for 16 bits is an error. True tracks, where given, go into ``ground_truth.npz``. The folder must not exist.
+    Args:
+        folder: Where to; it must not exist.
+        rgb: The color pictures, taken one by one.
+        depth: As many depth pictures [m], seen from the same camera; 0 or not finite where there is no reading.
+        camera: Its size is that of all pictures.
+        time_s: When each was taken [s].
+        state: What the robot was at each.
+        action: What it then did.
+        success: Whether the demonstration solved its task.
+        task: What the robot does.
+        depth_unit_m: What depth is rounded to: 0.0001 holds 6.5 m at a tenth of a millimeter.
+        query_px: Pixels (x, y) of the first frame whose true tracks are known, for ``ground_truth.npz``.
+        tracks_cam: Where their points are, in the camera frame of each instant [m].
+        visible: Whether the camera sees them.
+        role: The :class:`~flowlab.records.Role` of what they lie on.
+
+    Raises:
+        DataError: The folder exists or cannot be written, lengths or sizes differ, or a reading does not fit 16 bits.
     """
     if folder.exists():
         raise DataError(f"{folder}: exists already; delete it, or write the recording elsewhere")
     truth = {"query_px": query_px, "tracks_cam": tracks_cam, "visible": visible, "role": role}
-    temporary = folder.with_name(f".tmp-{os.getpid()}+{folder.name}")
+    samples = {name: values for name, values in {"state": state, "action": action}.items() if values is not None}
+    known: dict[str, Any] = {name: values for name, values in truth.items() if values is not None}
     try:
-        for name in ("color", "depth"):
-            (temporary / name).mkdir(parents=True, exist_ok=True)
-        _write_pictures(folder, temporary, rgb, depth, camera, len(time_s), depth_unit_m)
-        (temporary / "times.txt").write_text("".join(f"{t!r}\n" for t in np.asarray(time_s, float).tolist()))
-        named = {"state": state, "action": action}
-        for name, values in named.items():
-            if values is not None:
+        with new_folder(folder) as temporary:
+            _write_pictures(folder, temporary, rgb, depth, camera, len(time_s), depth_unit_m)
+            (temporary / "times.txt").write_text("".join(f"{t!r}\n" for t in np.asarray(time_s, float).tolist()))
+            for name, values in samples.items():
                 if len(values) != len(time_s):
                     raise DataError(f"{folder}: {len(values)} rows of {name} for {len(time_s)} frames")
                 np.save(temporary / f"{name}.npy", np.asarray(values, np.float32))
-        files = [name for name, values in named.items() if values is not None]
-        (temporary / FILE_NAME).write_text(_yaml(camera, files, depth_unit_m, success, task))
-        if query_px is not None:
-            known: dict[str, Any] = {name: values for name, values in truth.items() if values is not None}
-            np.savez_compressed(temporary / "ground_truth.npz", **known)
-        os.rename(temporary, folder)
+            (temporary / FILE_NAME).write_text(_yaml(camera, list(samples), depth_unit_m, success, task))
+            if query_px is not None:
+                np.savez_compressed(temporary / "ground_truth.npz", **known)
     except OSError as error:
         raise DataError(f"{folder}: the recording cannot be written ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _write_pictures(
@@ -77,6 +85,8 @@ def _write_pictures(
     depth_unit_m: float,
 ) -> None:
     size, t = (camera.height, camera.width), -1
+    for name in ("color", "depth"):
+        (into / name).mkdir()
     try:
         for t, (picture, meters) in enumerate(zip(rgb, depth, strict=True)):
             if picture.shape != (*size, 3) or meters.shape != size:
@@ -95,10 +105,10 @@ def _write_png(path: Path, picture: np.ndarray) -> None:
 
 def _counts(folder: Path, t: int, meters: np.ndarray, unit_m: float) -> np.ndarray:
     counts = np.rint(np.where(np.isfinite(meters) & (meters > 0), meters, 0).astype(np.float64) / unit_m)
-    if counts.max(initial=0) > MOST:
+    if counts.max(initial=0) > _MAX_COUNT:
         raise DataError(
             f"{folder}: frame {t} reads {meters[np.isfinite(meters)].max():.4g} m, and 16 bits of {unit_m} m hold "
-            f"{MOST * unit_m:.4g} m; use a greater depth_unit_m"
+            f"{_MAX_COUNT * unit_m:.4g} m; use a greater depth_unit_m"
         )
     return counts.astype(np.uint16)
 

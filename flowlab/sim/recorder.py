@@ -37,7 +37,7 @@ class ExpertSettings(Settings):
     """Steps the solved state is recorded for."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Rollout(Demonstration):
     """A simulated demonstration: what was done, and the poses from which any of it can be pictured."""
 

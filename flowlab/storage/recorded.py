@@ -1,11 +1,11 @@
 """Which recordings a dataset holds: each has a number that never changes, where simulation has a seed."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError
+from flowlab.text import natural_key
 
 
 class Recorded(Settings):
@@ -47,10 +47,5 @@ def number_recordings(known: Sequence[Recorded], found: Sequence[Recorded]) -> t
                 )
             table[key] = twin.model_copy(update={"source": one.source})
     first = max((r.seed for r in known), default=-1) + 1
-    fresh = sorted(new.values(), key=lambda r: (_natural(r.task), _natural(r.name)))
+    fresh = sorted(new.values(), key=lambda r: (natural_key(r.task), natural_key(r.name)))
     return (*table.values(), *(r.model_copy(update={"seed": first + k}) for k, r in enumerate(fresh)))
-
-
-def _natural(text: str) -> list[str | int]:
-    """What to sort by so that take-2 comes before take-10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", text)]

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import EllipsisType
 from typing import Any
@@ -16,7 +17,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, RecordError, first_line
 from flowlab.files import temporary_path
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
@@ -76,6 +77,18 @@ def episode_digest(episode: Episode) -> str:
     return digest.hexdigest()
 
 
+@dataclass(frozen=True, slots=True)
+class StoredArray:
+    """What an array of a shard is, without its values."""
+
+    path: str
+    """Below the shard: ``data/tracks``."""
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str
+
+
 class Shard:
     """A shard opened for reading."""
 
@@ -84,7 +97,7 @@ class Shard:
         try:
             self.group = zarr.open_group(path, mode="r", zarr_format=3)
         except (FileNotFoundError, ValueError, KeyError) as error:
-            raise DataError(f"{path}: not a readable zarr v3 group ({_first_line(error)}); {_REDO}") from error
+            raise DataError(f"{path}: not a readable zarr v3 group ({first_line(error)}); {_REDO}") from error
         self.attributes: Mapping[str, Any] = self.group.attrs.asdict()
         lacking = {"episodes", "camera", "entities", "settings_digest"} - self.attributes.keys()
         if lacking:
@@ -108,7 +121,7 @@ class Shard:
         try:
             return np.asarray(array[rows])
         except (ValueError, RuntimeError, OSError) as error:
-            raise DataError(f"{place}: damaged ({_first_line(error)}); {_REDO}") from error
+            raise DataError(f"{place}: damaged ({first_line(error)}); {_REDO}") from error
 
     def _open(self, spec_path: str) -> "zarr.Array[Any]":
         """An array, its values unread."""
@@ -118,7 +131,7 @@ class Shard:
         except KeyError as error:
             raise DataError(f"{place}: the array is missing; {_REDO}") from error
         except (ValueError, TypeError, OSError) as error:
-            raise DataError(f"{place}: damaged ({_first_line(error)}); {_REDO}") from error
+            raise DataError(f"{place}: damaged ({first_line(error)}); {_REDO}") from error
         if not isinstance(array, zarr.Array):
             raise DataError(f"{place}: damaged (it is no array); {_REDO}")
         return array
@@ -132,18 +145,18 @@ class Shard:
         estimated = any((self.path / path).exists() for path in QUALITY)
         return [s for s in SCHEMA if self.has(s) or not s.optional or (estimated and s.path in QUALITY)]
 
-    def describe(self) -> list[dict[str, Any]]:
-        """Name, dimensions, shape, type and unit of every array."""
+    def describe(self) -> list[StoredArray]:
+        """Every array, its values unread."""
         paths = [*(s.path for s in SCHEMA if self.has(s)), EPISODE_ENDS]
         arrays = {path: self._open(path) for path in paths}
         return [
-            {
-                "array": path,
-                "dimensions": ", ".join(map(str, getattr(a.metadata, "dimension_names", None) or ())),
-                "shape": " x ".join(map(str, a.shape)),
-                "type": str(a.dtype),
-                "unit": a.attrs.get("unit", ""),
-            }
+            StoredArray(
+                path=path,
+                dims=tuple(map(str, getattr(a.metadata, "dimension_names", None) or ())),
+                shape=a.shape,
+                dtype=str(a.dtype),
+                unit=str(a.attrs.get("unit", "")),
+            )
             for path, a in arrays.items()
         ]
 
@@ -165,6 +178,12 @@ class Shard:
         return self._episode(k, columns)
 
     def _episode(self, k: int, columns: Mapping[str, np.ndarray]) -> Episode:
+        try:
+            return self._decode(k, columns)
+        except (RecordError, KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{self.path}: episode {k} is damaged ({first_line(error)}); {_REDO}") from error
+
+    def _decode(self, k: int, columns: Mapping[str, np.ndarray]) -> Episode:
         about = self.attributes["episodes"][k]
         entities = tuple(Entity(g, b, Role[r.upper()]) for g, b, r in self.attributes["entities"])
         return Episode(
@@ -249,7 +268,3 @@ def _write(group: zarr.Group, path: str, values: np.ndarray, dims: tuple[str, ..
         attributes={"unit": unit, "meaning": meaning},
         config={"write_empty_chunks": True},  # so that a missing chunk always means damage
     )
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().split("\n")[0] or type(error).__name__

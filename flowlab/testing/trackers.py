@@ -15,9 +15,11 @@ from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from flowlab.geometry.camera import Camera
 from flowlab.records import Clip, Tracks2D
+from flowlab.testing.promises import require, require_words
 from flowlab.tracking.base import Tracker
 
 WIDTH, HEIGHT, FRAMES = 192, 128, 10
@@ -30,6 +32,9 @@ BIAS_PX = 0.25
 MEDIAN_PX = 1.0
 SAME_PX = 0.01
 
+_CHANNELS = {"xy": (2,), "xyz_cam": (3,)}
+"""What fields of a record have besides frames and points."""
+
 MakeTracker = Callable[[], Tracker]
 
 
@@ -39,7 +44,9 @@ class Rolling:
 
     clip: Clip
 
-    def move(self, xy: np.ndarray, start: np.ndarray | int, stop: np.ndarray | int) -> np.ndarray:
+    def move(
+        self, xy: Num[np.ndarray, "*#batch 2"], start: np.ndarray | int, stop: np.ndarray | int
+    ) -> Float[np.ndarray, "*out 2"]:
         """Where points (..., 2) of frame ``start`` are in frame ``stop``; exact, whatever their depth."""
         return _turn(xy, _angle(np.asarray(stop)) - _angle(np.asarray(start)))
 
@@ -84,9 +91,7 @@ def check_tracker(make: MakeTracker) -> None:
 def check_description(make: MakeTracker) -> None:
     """It has a name and a license, and describes itself in JSON."""
     tracker = make()
-    for field in ("name", "license"):
-        value = getattr(tracker, field, None)
-        _require(isinstance(value, str) and value, f"{field} must be some words, but is {value!r}")
+    require_words(tracker, "name", "license")
     try:
         json.dumps(tracker.describe())
     except TypeError as error:
@@ -99,7 +104,7 @@ def check_record(make: MakeTracker) -> None:
     before = queries.copy(), clip.rgb.copy(), clip.depth.copy()
     _check_record(make().open(clip).track(queries, 0, FRAMES), FRAMES, len(queries))
     given = zip((queries, clip.rgb, clip.depth), before, strict=True)
-    _require(all(np.array_equal(a, b) for a, b in given), "queries and clip must not be written into")
+    require(all(np.array_equal(a, b) for a, b in given), "queries and clip must not be written into")
 
 
 def check_query_frame(make: MakeTracker) -> None:
@@ -109,14 +114,14 @@ def check_query_frame(make: MakeTracker) -> None:
     _check_record(tracks, FRAMES, len(queries))
     off = np.abs(tracks.xy - queries[:, 1:]).max(-1)
     t, own = np.arange(FRAMES)[:, None], queries[:, 0]
-    _require(
+    require(
         off[t == own].max() < SAME_PX,
         f"at the frame of its query a point must be where the query says, but is up to {off[t == own].max():.2f} px "
         "away; queries are (t, x, y), tracks (x, y), pixel centers integers",
     )
-    _require(tracks.visible[t == own].all(), "a point must be visible at the frame of its query")
-    _require(off[t < own].max() < SAME_PX, "before the frame of its query a point must be held where the query says")
-    _require(not tracks.visible[t < own].any(), "before the frame of its query a point must not be visible")
+    require(tracks.visible[t == own].all(), "a point must be visible at the frame of its query")
+    require(off[t < own].max() < SAME_PX, "before the frame of its query a point must be held where the query says")
+    require(not tracks.visible[t < own].any(), "before the frame of its query a point must not be visible")
 
 
 def check_motion(make: MakeTracker) -> None:
@@ -141,7 +146,7 @@ def check_repeatable(make: MakeTracker) -> None:
     first = session.track(queries, 0, FRAMES)
     for again in (session.track(queries, 0, FRAMES), make().open(rolling().clip).track(queries, 0, FRAMES)):
         same = np.abs(first.xy - again.xy).max() < SAME_PX and np.array_equal(first.visible, again.visible)
-        _require(same, "the same queries must be answered in the same way every time; seed whatever is random")
+        require(same, "the same queries must be answered in the same way every time; seed whatever is random")
 
 
 def check_no_queries(make: MakeTracker) -> None:
@@ -155,9 +160,7 @@ def check_border(make: MakeTracker) -> None:
     tracks = make().open(rolling().clip).track(corners, 0, FRAMES)
     _check_record(tracks, FRAMES, len(corners))
     off = np.abs(tracks.xy[0] - corners[:, 1:]).max()
-    _require(
-        off < SAME_PX, f"a query in a corner of the picture must stay there at its frame, but is {off:.2f} px away"
-    )
+    require(off < SAME_PX, f"a query in a corner of the picture must stay there at its frame, but is {off:.2f} px away")
 
 
 CHECKS: tuple[Callable[[MakeTracker], None], ...] = (
@@ -182,19 +185,39 @@ def _queries(*frames: int) -> np.ndarray:
 
 
 def _check_record(tracks: Tracks2D, frames: int, points: int) -> None:
-    _require(isinstance(tracks, Tracks2D), f"track() must return a Tracks2D, but returns a {type(tracks).__name__}")
+    require(isinstance(tracks, Tracks2D), f"track() must return a Tracks2D, but returns a {type(tracks).__name__}")
     for field in fields(Tracks2D):
         value = getattr(tracks, field.name)
         if value is None and field.default is None:
             continue
         dtype = np.dtype(bool if field.name == "visible" else np.float32)
-        shape = (frames, points, 2) if field.name == "xy" else (frames, points)
-        _require(isinstance(value, np.ndarray), f"{field.name} must be a numpy array, but is a {type(value).__name__}")
-        _require(value.dtype == dtype, f"{field.name} must be {dtype}, but is {value.dtype}")
-        _require(value.shape == shape, f"{field.name} must have shape {shape}, but has {value.shape}")
-        _require(np.isfinite(value).all(), f"{field.name} must be finite, also where a point is lost")
+        shape = (frames, points, *_CHANNELS.get(field.name, ()))
+        require(isinstance(value, np.ndarray), f"{field.name} must be a numpy array, but is a {type(value).__name__}")
+        require(value.dtype == dtype, f"{field.name} must be {dtype}, but is {value.dtype}")
+        require(value.shape == shape, f"{field.name} must have shape {shape}, but has {value.shape}")
+        require(np.isfinite(value).all(), f"{field.name} must be finite, also where a point is lost")
     sure = tracks.confidence
-    _require(((sure >= 0) & (sure <= 1)).all(), "confidence must lie between 0 and 1")
+    require(((sure >= 0) & (sure <= 1)).all(), "confidence must lie between 0 and 1")
+    _check_positions(tracks)
+
+
+def _check_positions(tracks: Tracks2D) -> None:
+    """What a model says in 3D is what the tracks say in the picture."""
+    if tracks.xyz_cam is None:
+        return
+    placed = (tracks.xyz_cam != 0).any(-1)
+    require(
+        (tracks.xyz_cam[placed][:, 2] > 0).all(),
+        "xyz_cam must lie before the camera, z forward [m], or be (0, 0, 0) where no position is known",
+    )
+    uv, _ = rolling().clip.camera.project(tracks.xyz_cam[placed].astype(np.float64))
+    off = np.linalg.norm(uv - tracks.xy[placed], axis=-1)[tracks.visible[placed]]
+    median = float(np.median(off)) if len(off) else 0.0
+    require(
+        median < MEDIAN_PX,
+        f"xyz_cam must project to xy, but is {median:.2f} px away; it is in the camera frame [m]: x right, y down, "
+        "z forward",
+    )
 
 
 def _check_motion(tracks: Tracks2D, queries: np.ndarray, start: int) -> None:
@@ -207,16 +230,11 @@ def _check_motion(tracks: Tracks2D, queries: np.ndarray, start: int) -> None:
     median = float(np.median(np.linalg.norm(error, axis=-1)))
     swapped = float(np.median(np.linalg.norm((tracks.xy[..., ::-1] - truth)[after], axis=-1)))
     hint = "; x and y are swapped" if swapped < median / 4 else "; queries are (t, x, y), tracks (x, y)"
-    _require(median < MEDIAN_PX, f"half of the points are more than {median:.2f} px from where they should be{hint}")
+    require(median < MEDIAN_PX, f"half of the points are more than {median:.2f} px from where they should be{hint}")
     bias = np.median(error, axis=0)
-    _require(
+    require(
         np.abs(bias).max() < BIAS_PX,
         f"points are shifted by ({bias[0]:+.2f}, {bias[1]:+.2f}) px; the center of the first pixel is (0, 0)",
     )
     seen = float(tracks.visible[after].mean())
-    _require(seen > 0.8, f"all points are in sight, but only {seen:.0%} of them are visible")
-
-
-def _require(holds: object, message: str) -> None:
-    if not holds:
-        raise AssertionError(message)
+    require(seen > 0.8, f"all points are in sight, but only {seen:.0%} of them are visible")

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -12,20 +11,26 @@ from pydantic import ValidationError
 from flowlab.config import Settings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.records import Clip, Tracks2D
-
-GROUP = "flowlab.trackers"
-"""Entry-point group in which a package offers trackers of its own."""
+from flowlab.registry import TRACKERS
 
 
 class Session(Protocol):
     """One clip, opened by a tracker: whatever is made once per frame is made here, once."""
 
     def track(self, queries_txy: Float32[np.ndarray, "M 3"], start: int, stop: int) -> Tracks2D:
-        """Follow points through frames ``start`` to ``stop - 1``; row k of the result is frame ``start + k``.
+        """Follow points through part of the clip.
 
-        A query is (t, x, y): its frame, ``start <= t < stop``, and its pixel there, integer pixel centers.
         At its own frame a point is where it was asked for, and visible; before it, it is held there and
         not visible.
+
+        Args:
+            queries_txy: (t, x, y) of every point: its frame, ``start <= t < stop``, and its pixel there, integer
+                pixel centers.
+            start: The first frame that is asked for.
+            stop: The frame after the last.
+
+        Returns:
+            Tracks through frames ``start`` to ``stop - 1``; row k is frame ``start + k``.
         """
         ...
 
@@ -48,24 +53,23 @@ class Tracker(Settings, ABC):
         return {"tracker": self.name, "license": self.license, "options": self.model_dump(mode="json")}
 
 
-def known_trackers() -> dict[str, str]:
-    """The import path of every installed tracker, by name."""
-    return {e.name: e.value for e in entry_points(group=GROUP)}
-
-
 def make_tracker(name: str, options: Mapping[str, Any] | None = None) -> Tracker:
-    """A tracker by name, with options. Raises :class:`UsageError` for names and options that do not exist."""
-    found = [e for e in entry_points(group=GROUP) if e.name == name]
-    if not found:
-        raise unknown_name("tracker", name, known_trackers())
-    cls = found[0].load()
+    """A tracker with options.
+
+    Args:
+        name: An installed tracker, or an import path ``module:Class``.
+        options: Values of the tracker's own fields.
+
+    Raises:
+        UsageError: There is no such tracker, or no such option, or an option has a value that does not fit.
+    """
+    cls = TRACKERS.load(name)
     try:
-        tracker = cls.model_validate(dict(options or {}))
+        tracker: Tracker = cls.model_validate(dict(options or {}))
     except ValidationError as error:
         first = error.errors()[0]
         option = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             raise UsageError(f"tracker '{name}': {unknown_name('option', option, cls.model_fields)}") from error
         raise UsageError(f"tracker '{name}': {option}: {first['msg']} (found {first['input']!r})") from error
-    assert isinstance(tracker, Tracker)
     return tracker

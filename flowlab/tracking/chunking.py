@@ -44,7 +44,7 @@ def follow(clip: Clip, queries_xy: Float32[np.ndarray, "M 2"], tracker: Tracker,
     What is lost stays lost: a chunk has no way to know whether its first frame shows the point or something in
     front of it, so its confidence is multiplied by what its start deserves, and where the point was not visible
     at its start the chunk cannot make it visible. Only one that began while the point was in sight can find it
-    again; a point out of sight for about ``length - stride`` frames is not found again. Of a model's depth and
+    again; a point out of sight for about ``length - stride`` frames is not found again. Of a model's positions and
     residual nothing is kept: a tracker that fits one wants the clip whole.
     """
     session = tracker.open(clip)

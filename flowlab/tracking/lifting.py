@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pydantic import Field
 
 from flowlab.config import Settings
+from flowlab.geometry.transforms import apply
 from flowlab.records import Clip, PositionSource, Tracks2D
 
 MEASURED, MODEL, FILLED = int(PositionSource.MEASURED), int(PositionSource.MODEL), int(PositionSource.FILLED)
@@ -57,16 +58,35 @@ class Lifted:
 def lift(clip: Clip, tracks: Tracks2D, settings: LiftSettings) -> Lifted:
     """Tracks in the world from tracks in the picture, of points queried at frame 0.
 
-    At frame 0 a point is where its own pixel is read. Afterwards it is where the tracker's model puts it, if there
-    is one; else, where the tracker sees it and a layer of the depth around it continues the point, it is measured;
-    else it is filled. Where the tracker sees a point in a hole of the depth picture, it is filled on the ray of its
-    pixel, at a depth between those known before and after; elsewhere in a straight line between such instants, held
-    before the first and after the last. A point of which no depth is ever known is filled at the median depth of
-    the clip (1 m in a clip without depth).
+    At frame 0 a point is where its own pixel is read. Afterwards it is where the tracker's model of the motion puts
+    it (``xyz_cam``), if there is one; else, where the tracker sees it and a layer of the depth around it continues
+    the point, it is measured; else it is filled. Where the tracker sees a point in a hole of the depth picture, it is
+    filled on the ray of its pixel, at a depth between those known before and after; elsewhere in a straight line
+    between such instants, held before the first and after the last. A point of which no depth is ever known is filled
+    at the median depth of the clip (1 m in a clip without depth).
+
+    Args:
+        clip: The pictures, depth [m] among them.
+        tracks: Pixels of every point in every frame.
+        settings: Which readings around a pixel are the point's own.
+
+    Returns:
+        Positions in the world frame [m], and how each came about.
     """
-    model_z = np.zeros(tracks.visible.shape, np.float32) if tracks.depth is None else tracks.depth
+    model = np.zeros((*tracks.visible.shape, 3), np.float32) if tracks.xyz_cam is None else tracks.xyz_cam
     z, source, depth_valid, hidden = _read(
-        clip.depth, tracks.xy, tracks.visible, model_z, *map(float, settings.model_dump().values())
+        clip.depth,
+        tracks.xy,
+        tracks.visible,
+        model[..., 2],
+        window_px=settings.window_px,
+        spread_px=settings.spread_px,
+        nearness_m_per_px=settings.nearness_m_per_px,
+        noise_m_per_m2=settings.noise_m_per_m2,
+        layer_m=settings.layer_m,
+        jump_m=settings.jump_m,
+        unseen_m=settings.unseen_m,
+        reach_m=settings.reach_m,
     )
     known = source != FILLED
     never = ~known.any(0)
@@ -75,7 +95,10 @@ def lift(clip: Clip, tracks: Tracks2D, settings: LiftSettings) -> Lifted:
         z[0, never], known[0, never] = np.median(readings) if len(readings) else 1.0, True
     visible = tracks.visible & ~hidden
     z = _between(z[..., None], known)[..., 0]
-    xyz_world = _between(clip.camera.unproject(tracks.xy, z), known | visible)
+    xyz_world = clip.camera.unproject(tracks.xy, z)
+    from_model = source == MODEL
+    xyz_world[from_model] = apply(clip.camera.T_world_cam, model[from_model].astype(np.float64))
+    xyz_world = _between(xyz_world, known | visible)
     return Lifted(xyz_world.astype(np.float32), visible, source, depth_valid)
 
 
@@ -91,37 +114,48 @@ def _between(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True)
 def _read(  # type: ignore[no-untyped-def]
-    depth, xy, visible, model_z, window, spread, nearness, noise, layer, jump, unseen, reach
+    depth,
+    xy,
+    visible,
+    model_z,
+    window_px,
+    spread_px,
+    nearness_m_per_px,
+    noise_m_per_m2,
+    layer_m,
+    jump_m,
+    unseen_m,
+    reach_m,
 ):
     """Depth, source, whether a reading fits, and whether something else was read instead: (T, M) each."""
     steps, points = visible.shape
     z, source = np.zeros((steps, points)), np.full((steps, points), FILLED, np.uint8)
     fits, hidden = np.zeros((steps, points), np.bool_), np.zeros((steps, points), np.bool_)
-    side = 2 * int(window) + 1
+    side = 2 * window_px + 1
     around, distance = np.empty(side * side), np.empty(side * side)
     for m in range(points):
         last, extra = 0.0, 0.0  # depth where last known, and how much farther it may have moved since
         for t in range(steps):
             u, v = xy[t, m]
             own = _own_reading(depth[t], u, v)
-            count = _readings(depth[t], u, v, int(window), around, distance)
+            count = _readings(depth[t], u, v, window_px, around, distance)
             if t == 0 and own > 0:
                 z[t, m], source[t, m], fits[t, m] = own, MEASURED, True
             elif model_z[t, m] > 0:
                 z[t, m], source[t, m] = model_z[t, m], MODEL
-                nearest = _continuing(around[:count], distance[:count], z[t, m], nearness)
-                fits[t, m] = abs(nearest - z[t, m]) < jump + 2 * noise * z[t, m] ** 2
+                nearest = _continuing(around[:count], distance[:count], z[t, m], nearness_m_per_px)
+                fits[t, m] = abs(nearest - z[t, m]) < jump_m + 2 * noise_m_per_m2 * z[t, m] ** 2
             elif visible[t, m] and own >= 0 and count > 0:
-                nearest = _continuing(around[:count], distance[:count], last, nearness)
-                fits[t, m] = last == 0 or abs(nearest - last) < jump + 2 * noise * last**2 + extra
+                nearest = _continuing(around[:count], distance[:count], last, nearness_m_per_px)
+                fits[t, m] = last == 0 or abs(nearest - last) < jump_m + 2 * noise_m_per_m2 * last**2 + extra
                 hidden[t, m] = not fits[t, m]
                 if fits[t, m]:
-                    thickness = layer + noise * nearest**2
-                    z[t, m] = _layer_mean(around[:count], distance[:count], nearest, thickness, spread)
+                    thickness = layer_m + noise_m_per_m2 * nearest**2
+                    z[t, m] = _layer_mean(around[:count], distance[:count], nearest, thickness, spread_px)
                     source[t, m] = MEASURED
             else:
                 hidden[t, m] = own < 0
-                extra = min(extra + unseen, reach)
+                extra = min(extra + unseen_m, reach_m)
             if source[t, m] != FILLED:
                 last, extra = z[t, m], 0.0
     return z, source, fits, hidden

@@ -183,10 +183,10 @@ def _run(trainer: Trainer, watch: Watch) -> TrainedRun:
         validation=last_metrics(metrics, "validation") if first else {},
     )
     if found.training or found.validation:
-        from flowlab.viz.curve_figure import draw_curve
+        from flowlab.viz.training_figure import draw_training
 
         with writing_run(trainer.folder):
-            draw_curve(metrics, found.curve)
+            draw_training(metrics, found.curve)
     return found
 
 

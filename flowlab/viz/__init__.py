@@ -1,1 +1,1 @@
-"""Pictures of episodes: Rerun recordings, still images and films. The only package that knows Rerun."""
+"""Pictures of episodes: Rerun recordings, still images, videos and figures. The only package that knows Rerun."""

@@ -6,15 +6,15 @@ import rerun.blueprint as rrb
 from jaxtyping import Float
 
 from flowlab.records import Episode
-from flowlab.viz.upright import up_from_world
+from flowlab.viz.orientation import up_from_world
 
 CAMERA = "/world/camera/main"
 DEPTH = f"{CAMERA}/depth"
 RGB = f"{CAMERA}/rgb"
 
 
-def layout(episode: Episode, *, flow_error: bool = False) -> rrb.Blueprint:
-    """The scene large, pictures and facts and plots beside it; ``flow_error`` says whether that is plotted."""
+def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Blueprint:
+    """The scene large, pictures, a table and plots beside it; ``flow_error`` says whether that is plotted."""
     pictures = [
         rrb.Spatial2DView(origin=CAMERA, contents=[f"+ {entity}"], name=name)
         for entity, name, there in [(RGB, "rgb", episode.rgb), (DEPTH, "depth", episode.depth)]
@@ -61,11 +61,11 @@ def _eye(episode: Episode) -> rrb.EyeControls3D:
     towards = R_up_world @ episode.camera.T_world_cam[:3, 3] - center
     azimuth, elevation = np.arctan2(towards[1], towards[0]) + 0.6, np.deg2rad(30)
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    position = center + size(episode) * np.array(direction)
+    position = center + scene_size(episode) * np.array(direction)
     return rrb.EyeControls3D(position=position @ R_up_world, look_target=center @ R_up_world, eye_up=R_up_world[2])
 
 
-def size(episode: Episode) -> float:
+def scene_size(episode: Episode) -> float:
     """Length [m] of the scene's box, which dots, lines and axes are scaled by."""
     low, high = _box_up(episode)
     return float(np.linalg.norm(high - low))

@@ -1,4 +1,4 @@
-"""The strip below the pictures of a film: whose they are, the step, and what marks and colors mean."""
+"""The bar below the pictures of a video: whose they are, the step, and what marks and colors mean."""
 
 from textwrap import wrap
 from typing import Any, cast
@@ -17,15 +17,15 @@ from flowlab.viz.colors import PREDICTED_RGB, SIGMA_LIMIT, role_rgb, sigma_rgb
 
 _DPI = 128
 """A power of two, so that sizes in inches are whole pixels."""
-_BACK, _INK, _QUIET, _ALARM = "#14171c", "#e9ecf0", "#9aa3ae", "#ff8190"
+_BACKGROUND, _INK, _QUIET, _ALARM = "#14171c", "#e9ecf0", "#9aa3ae", "#ff8190"
 _WIDTH, _HEIGHT, _NOTE_HEIGHT = 640, 84, 18
-"""What the layout below is drawn for [px]; a wider picture has a larger strip."""
+"""What all lengths here are for [px]; a wider picture has a larger bar."""
 _PROGRESS_HEIGHT = 5
 _TO_COME_LIGHT = 0.3
 
 
 class CaptionBar:
-    """Draws the strip of every step. Along its top runs how far the film is, in the color of that step's
+    """Draws the bar of every step. Along its top runs how far the video is, in the color of that step's
     median stated error where there is one."""
 
     def __init__(self, episode: Episode, width: int, title: str, note: str, *, predicted: bool = False) -> None:
@@ -35,7 +35,7 @@ class CaptionBar:
         lines = wrap(note, int(self._width / 6.4), max_lines=3, placeholder=" …")
         self._height = _HEIGHT + _NOTE_HEIGHT * len(lines)
         size = width / _DPI, round(self._height * self._scale) / _DPI
-        self._figure = Figure(size, dpi=_DPI, facecolor=_BACK)
+        self._figure = Figure(size, dpi=_DPI, facecolor=_BACKGROUND)
         self._canvas = canvas = cast(Any, FigureCanvasAgg(self._figure))  # matplotlib does not say its types
         self._write(14, 24, title, size=14, weight="bold")
         if tracker_name(episode):
@@ -51,7 +51,7 @@ class CaptionBar:
         self._progress = self._draw_progress(width)
 
     def draw(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
-        """The strip of step t."""
+        """The bar of step t."""
         episode, count = self._episode, self._episode.queries.count
         self._canvas.restore_region(self._background)
         self._step.set_text(f"step {t} / {len(episode) - 1}    {episode.time_s[t]:.2f} s")

@@ -1,4 +1,4 @@
-"""The colors that recordings, stills and films share: tracks loud, by role or by stated error; clouds quiet."""
+"""The colors that recordings, stills and videos share: tracks loud, by role or by stated error; clouds quiet."""
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -28,7 +28,7 @@ SERIES_RGB = [
 """Lines of one plot, in turn."""
 SUCCESS_RGB = (255, 255, 255)
 PREDICTED_RGB = (232, 255, 84)
-"""What a policy expects: brighter than any role, and than clouds."""
+"""What a policy predicts: brighter than any role, and than clouds."""
 _PALETTE = np.array([ROLE_RGB[role] for role in (*Role, UNKNOWN)], np.uint8)  # so that -1 finds the last
 _CLOUD_GRAY = np.array([150, 154, 160])
 

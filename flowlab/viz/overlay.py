@@ -1,12 +1,12 @@
-"""Query points, their trails and what a policy expects of them, drawn over one enlarged picture of an episode."""
+"""Query points, their trails and what a policy predicts of them, drawn over one enlarged picture of an episode."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
 from flowlab.records import Episode, FlowPrediction, PositionSource
 from flowlab.viz.colors import PREDICTED_RGB, track_rgb
+from flowlab.viz.orientation import project_upright
 from flowlab.viz.plan_predictions import PlanPrediction, plan_predictions
-from flowlab.viz.upright import upright_pixels
 
 _RIM = (16, 18, 22)
 """Around every mark, so that it shows on any picture."""
@@ -14,7 +14,7 @@ _HIDDEN_LIGHT = 0.75
 _TRAIL_ALPHA = (0.9, 0.7, 0.45, 0.22)
 """How opaque a trail is, from its newest quarter to its oldest."""
 _PATH_RIM_ALPHA = 0.5
-"""How opaque the rim of an expected path is: there are many, and they lie close."""
+"""How opaque the rim of a predicted path is: there are many, and they lie close."""
 _SUBPIXEL = 4
 """Bits of OpenCV's fixed-point coordinates."""
 
@@ -22,7 +22,7 @@ _SUBPIXEL = 4
 class Overlay:
     """What is drawn over the pictures of an episode: a disc where a point is in sight, a ring where it is not,
     a cross where its position was filled in; behind each, its trail. Between the two lie the paths that the plan in
-    force had foreseen, from where its points were when it was made.
+    force predicts, from where its points were when it was made.
 
     ``scale`` is how many canvas pixels a pixel of the picture has, ``trail`` (at least 1) how many steps a trail
     goes back.
@@ -42,11 +42,11 @@ class Overlay:
         self._plans = [] if prediction is None else plan_predictions(episode, prediction)
 
     def draw(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
-        """Draw trails, expected paths and points of step t onto the canvas."""
+        """Draw trails, predicted paths and points of step t onto the canvas."""
         self._draw_trails(canvas, t)
         in_force = [plan for plan in self._plans if plan.step <= t]
         if in_force:
-            self._draw_forecast(canvas, in_force[-1])
+            self._draw_prediction(canvas, in_force[-1])
         there, visible, filled = self._there[t], self._visible[t], self._filled[t]
         for k in np.flatnonzero(there & filled):
             self._draw_cross(canvas, t, int(k))
@@ -60,16 +60,16 @@ class Overlay:
     ) -> tuple[Int[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
         """Where points are on the canvas, in OpenCV's fixed point, and whether they are anywhere near it."""
         camera, scale = self._episode.camera, self._scale
-        canvas_uv = (upright_pixels(camera, xyz_world) + 0.5) * scale - 0.5  # the center of a pixel, enlarged
+        canvas_uv = (project_upright(camera, xyz_world) + 0.5) * scale - 0.5  # the center of a pixel, enlarged
         far = 8 * max(camera.width, camera.height) * scale  # OpenCV counts in 32 bits
         there = np.all(np.abs(canvas_uv) < far, axis=-1)
         return np.round(np.where(there[..., None], canvas_uv, 0) * 2**_SUBPIXEL).astype(np.int32), there
 
-    def _draw_forecast(self, canvas: UInt8[np.ndarray, "H W 3"], plan: PlanPrediction) -> None:
+    def _draw_prediction(self, canvas: UInt8[np.ndarray, "H W 3"], plan: PlanPrediction) -> None:
         """Thin bright lines, each with a dot at its end, as far as they can be seen from the camera."""
         import cv2
 
-        uv, there = self._on_canvas(plan.expected_world[:, plan.predicted_moving])
+        uv, there = self._on_canvas(plan.predicted_world[:, plan.predicted_moving])
         paths, ends = [path[ok] for path, ok in zip(uv.swapaxes(0, 1), there.T, strict=True)], uv[-1][there[-1]]
         for width, radius, rgb, alpha in ((2.6, 3.2, _RIM, _PATH_RIM_ALPHA), (1.0, 2.4, PREDICTED_RGB, 1.0)):
             layer = canvas.copy()

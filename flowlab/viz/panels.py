@@ -1,13 +1,10 @@
 """What stills are made of: a camera's view and a side view, a legend of time, and the marks in them."""
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
@@ -16,49 +13,30 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import ColorType
 
-from flowlab.files import temporary_path
 from flowlab.geometry.camera import Camera
 from flowlab.records import Episode
 from flowlab.viz.captions import role_name
 from flowlab.viz.colors import role_rgb
-from flowlab.viz.upright import in_camera_frame, up_from_world
+from flowlab.viz.orientation import up_from_world, world_is_camera_frame
+from flowlab.viz.plot_style import GRID, INK, LABEL_PT, QUIET, TICK_PT, hide_frame, new_figure
 
 TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#3b1f8f", "#a3218e", "#e2486a", "#f58a3c", "#f7bf3a"])
 """From the first step to the last: distinct from gray and readable on white."""
 LEFT = 0.025
-INK, QUIET = "#22262c", "#747b85"
 _SIZE_IN = (12.0, 6.4)
-_DPI = 150
 _BOXES = {"camera": (LEFT, 0.145, 0.43, 0.70), "side": (0.525, 0.145, 0.40, 0.70), "bar": (0.945, 0.145, 0.009, 0.70)}
 """Left, bottom, width and height of each panel, as shares of the picture."""
 
 
-def panels(title: str, caption: str) -> tuple[Figure, Axes, Axes]:
+def two_panels(title: str, caption: str) -> tuple[Figure, Axes, Axes]:
     """A figure with a title, a caption, and room for a camera's view and a side view."""
-    figure = Figure(figsize=_SIZE_IN, dpi=_DPI)
-    FigureCanvasAgg(figure)
+    figure = new_figure(*_SIZE_IN)
     figure.text(LEFT, 0.955, title, fontsize=17, weight="bold", color=INK, va="center")
     figure.text(LEFT, 0.038, caption, fontsize=9.5, color=QUIET, va="center")
     return figure, figure.add_axes(_BOXES["camera"]), figure.add_axes(_BOXES["side"])
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG. ``path`` is either absent, as before, or whole."""
-    temporary = temporary_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        figure.savefig(temporary, format="png", facecolor="white")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def set_title(axes: Axes, text: str) -> None:
-    """Say above a panel what it shows."""
-    axes.set_title(text, loc="left", fontsize=10.5, color=INK, pad=10)
-
-
-def as_picture(axes: Axes) -> None:
+def style_as_picture(axes: Axes) -> None:
     """Let y point down, as pixels are counted, and leave out their numbers."""
     axes.invert_yaxis()
     axes.set_xticks([])
@@ -71,9 +49,9 @@ class SideView:
 
     def __init__(self, camera: Camera, tracks: Float[np.ndarray, "T M 3"], moved: Float[np.ndarray, "T K 3"]) -> None:
         self._R_world_up = R_world_up = up_from_world(camera).T
-        self._names = ("x", "z", "−y") if in_camera_frame(camera) else ("x", "y", "z")
+        self._names = ("x", "z", "−y") if world_is_camera_frame(camera) else ("x", "y", "z")
         reach = np.ptp(moved @ R_world_up, axis=0).max(0)
-        self._across, self._along = (1, 0) if reach[1] >= reach[0] or in_camera_frame(camera) else (0, 1)
+        self._across, self._along = (1, 0) if reach[1] >= reach[0] or world_is_camera_frame(camera) else (0, 1)
         place = camera.T_world_cam[:3, 3] @ R_world_up
         self._side = 1 if place[self._along] >= np.median((tracks[0] @ R_world_up)[:, self._along]) else -1
 
@@ -87,24 +65,24 @@ class SideView:
         flat: np.ndarray = (xyz_world @ self._R_world_up)[..., [self._across, 2]]
         return flat
 
-    def away(self, xyz_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+    def depth(self, xyz_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """How far away [m] points are, against each other."""
-        depth: np.ndarray = -self._side * (xyz_world @ self._R_world_up)[..., self._along]
-        return depth
+        distance: np.ndarray = -self._side * (xyz_world @ self._R_world_up)[..., self._along]
+        return distance
 
     def label(self, axes: Axes) -> None:
         """Turn axes as one sees them from here, and say what they are."""
         if (self._across == 1) != (self._side == 1):  # from -x, y points left; from +y, x does
             axes.invert_xaxis()
-        axes.set_xlabel(f"{self._names[self._across]} [m]", color=QUIET, fontsize=9)
-        axes.set_ylabel(f"{self._names[2]} [m]", color=QUIET, fontsize=9)
-        axes.tick_params(length=0, labelsize=8.5, labelcolor=QUIET)
+        axes.set_xlabel(f"{self._names[self._across]} [m]", color=QUIET, fontsize=LABEL_PT)
+        axes.set_ylabel(f"{self._names[2]} [m]", color=QUIET, fontsize=LABEL_PT)
+        axes.tick_params(length=0, labelsize=TICK_PT, labelcolor=QUIET)
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-        axes.grid(color="#eceef1", linewidth=0.8)
+        axes.grid(color=GRID, linewidth=0.8)
 
 
-def fit(axes: Axes, points: Float[np.ndarray, "K 2"], margin: float) -> None:
+def fit_limits(axes: Axes, points: Float[np.ndarray, "K 2"], margin: float) -> None:
     """Limits that hold all points, with the same scale both ways; but the ``margin`` percent on either side only
     if they are near the rest."""
     low, high = np.nanpercentile(points, [margin, 100 - margin], axis=0)
@@ -120,22 +98,21 @@ def fit(axes: Axes, points: Float[np.ndarray, "K 2"], margin: float) -> None:
 def draw_cloud(
     axes: Axes,
     cloud: Float[np.ndarray, "P 2"],
-    away: Float[np.ndarray, "P"],
+    depth: Float[np.ndarray, "P"],
     rgb: UInt8[np.ndarray, "P 3"],
     size: float = 6.0,
 ) -> None:
     """Points in the plane of the axes, far ones first, pale and small: ``size`` is the least area [pt²]."""
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    hide_frame(axes)
     axes.set_axisbelow(True)
-    order = np.argsort(-away)
-    nearness = 1 - (away - away.min()) / max(float(np.ptp(away)), 1e-9)
+    order = np.argsort(-depth)
+    nearness = 1 - (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
     pale = 1 - (1 - rgb / 255) * (0.5 + 0.3 * nearness)[:, None]
     area = size * (1 + 7 / 6 * nearness)
     axes.scatter(cloud[order, 0], cloud[order, 1], s=area[order], c=pale[order], linewidths=0, zorder=2)
 
 
-def trail(track: Float[np.ndarray, "T 2"], width: float = 1.2) -> LineCollection:
+def trail_lines(track: Float[np.ndarray, "T 2"], width: float = 1.2) -> LineCollection:
     """One track, colored by time; ``width`` is in points."""
     colors = TIME_COLORS(np.linspace(0, 1, max(len(track) - 1, 1)))
     pieces = np.stack([track[:-1], track[1:]], 1)
@@ -147,11 +124,11 @@ def draw_time_bar(figure: Figure, end: float, label: str, *, whole: bool = False
     times = ScalarMappable(Normalize(0, max(end, 1e-9)), TIME_COLORS)
     bar = figure.colorbar(times, cax=figure.add_axes(_BOXES["bar"]), ticks=MaxNLocator(6, integer=whole))
     bar.outline.set_visible(False)
-    bar.set_label(label, color=QUIET, fontsize=9)
-    bar.ax.tick_params(length=0, labelsize=8.5, labelcolor=QUIET)
+    bar.set_label(label, color=QUIET, fontsize=LABEL_PT)
+    bar.ax.tick_params(length=0, labelsize=TICK_PT, labelcolor=QUIET)
 
 
-def legend(figure: Figure, entries: Sequence[Line2D], length: float = 0.8) -> None:
+def draw_legend(figure: Figure, entries: Sequence[Line2D], length: float = 0.8) -> None:
     """One line between panels and caption; lines in it are ``length`` letters long."""
     figure.legend(
         handles=entries, loc="lower left", bbox_to_anchor=(LEFT, 0.078), ncols=len(entries), frameon=False,

@@ -1,4 +1,4 @@
-"""What a policy's plans foresaw, each beside what then came: what pictures of predicted flow are drawn from."""
+"""What a policy's plans predicted, each beside what then came: what pictures of predicted flow are drawn from."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,46 +8,46 @@ from jaxtyping import Bool, Float, Float32
 
 from flowlab.records import Episode, FlowPrediction, Role
 
-EXPECTED_M = 0.002
-"""A path is drawn if its point is expected to get this far from where it was [m]."""
-MOVES_M = 0.005
+PREDICTED_M = 0.002
+"""A path is drawn if its point is predicted to get this far from where it was [m]."""
+MOVING_M = 0.005
 """A point truly moves under a plan if it gets this far from where it was while the plan is executed [m]; as in
 evaluations."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanPrediction:
-    """One plan of an episode: the paths it foresaw of the distinct query points, and those they took."""
+    """One plan of an episode: the predicted paths of the distinct query points, and those they took."""
 
     step: int
     """When it was made."""
-    expected_world: Float32[np.ndarray, "H M 3"]
-    """Row 0: where every point was then [m]; row k: where it was expected after k more actions."""
+    predicted_world: Float32[np.ndarray, "H M 3"]
+    """Row 0: where every point was then [m]; row k: where it was predicted after k more actions."""
     true_world: Float32[np.ndarray, "K M 3"]
     """Where the points were [m], up to the step of the next plan (K - 1 actions of this one were executed)."""
 
     @property
     def predicted_moving(self) -> Bool[np.ndarray, "M"]:
-        """Which points were expected to move."""
-        far: np.ndarray = _reach(self.expected_world) > EXPECTED_M
+        """Which points were predicted to move."""
+        far: np.ndarray = _farthest(self.predicted_world) > PREDICTED_M
         return far
 
     @property
-    def moves(self) -> Bool[np.ndarray, "M"]:
+    def moving(self) -> Bool[np.ndarray, "M"]:
         """Which points did move."""
-        far: np.ndarray = _reach(self.true_world) > MOVES_M
+        far: np.ndarray = _farthest(self.true_world) > MOVING_M
         return far
 
     @property
     def error(self) -> Float[np.ndarray, "K-1 N"]:
-        """How far from where they were expected the N points that did move were [m], after each executed action."""
-        off = self.expected_world[1 : len(self.true_world)] - self.true_world[1:]
-        distance: np.ndarray = np.linalg.norm(off[:, self.moves], axis=-1)
+        """How far from the prediction the N points that did move were [m], after each executed action."""
+        off = self.predicted_world[1 : len(self.true_world)] - self.true_world[1:]
+        distance: np.ndarray = np.linalg.norm(off[:, self.moving], axis=-1)
         return distance
 
-    def stir_of(self, points: Bool[np.ndarray, "M"]) -> float:
-        """How far some points were expected to get, on average [m]; 0 for none."""
-        return float(_reach(self.expected_world[:, points]).mean()) if points.any() else 0.0
+    def mean_predicted_distance(self, points: Bool[np.ndarray, "M"]) -> float:
+        """How far some points were predicted to get, on average [m]; 0 for none."""
+        return float(_farthest(self.predicted_world[:, points]).mean()) if points.any() else 0.0
 
 
 def plan_predictions(episode: Episode, prediction: FlowPrediction) -> list[PlanPrediction]:
@@ -61,23 +61,23 @@ def plan_predictions(episode: Episode, prediction: FlowPrediction) -> list[PlanP
     ]
 
 
-def most_telling(episode: Episode, plans: list[PlanPrediction]) -> int:
-    """Index of the plan that expects the objects to move farthest, or all points where nobody knows which are."""
+def largest_predicted_motion(episode: Episode, plans: list[PlanPrediction]) -> int:
+    """Index of the plan that predicts the objects to move farthest, or all points where nobody knows which are."""
     points = episode.query_role[: episode.queries.count] == Role.OBJECT
     if not points.any():
         points = np.ones_like(points)
-    return int(np.argmax([plan.stir_of(points) for plan in plans]))
+    return int(np.argmax([plan.mean_predicted_distance(points) for plan in plans]))
 
 
-def errors(plans: list[PlanPrediction]) -> Iterator[tuple[int, float]]:
-    """Steps, and how far off the points that move then were on average [m], as the last plan before the step had
-    foreseen it. Steps of plans under which nothing moves are left out."""
+def prediction_errors(plans: list[PlanPrediction]) -> Iterator[tuple[int, float]]:
+    """Steps, and how far off the points that move then were on average [m], by the last plan before the
+    step. Steps of plans under which nothing moves are left out."""
     for plan in plans:
-        if plan.moves.any():
+        if plan.moving.any():
             yield from ((plan.step + k, float(off.mean())) for k, off in enumerate(plan.error, 1))
 
 
-def _reach(paths: Float32[np.ndarray, "H M 3"]) -> Float[np.ndarray, "M"]:
+def _farthest(paths: Float32[np.ndarray, "H M 3"]) -> Float[np.ndarray, "M"]:
     """How far [m] each path gets from its start."""
     distance: np.ndarray = np.linalg.norm(paths - paths[:1], axis=-1).max(0)
     return distance

@@ -1,4 +1,4 @@
-"""An episode as a Rerun recording, with a layout that opens well."""
+"""An episode as a Rerun recording, with a blueprint that opens well."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -12,23 +12,23 @@ from jaxtyping import Bool, UInt8
 from flowlab.files import temporary_path
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode, FlowPrediction
-from flowlab.viz.blueprint import CAMERA, DEPTH, RGB, layout, size
+from flowlab.viz.blueprint import CAMERA, DEPTH, RGB, make_blueprint, scene_size
 from flowlab.viz.captions import describe
 from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
-from flowlab.viz.plan_predictions import EXPECTED_M, MOVES_M, PlanPrediction, errors, plan_predictions
-from flowlab.viz.upright import in_camera_frame
+from flowlab.viz.orientation import world_is_camera_frame
+from flowlab.viz.plan_predictions import MOVING_M, PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
 
 TRAIL_STEPS = 20
 """A trail shows where a point was over this many steps."""
-_STILL = 1e-3
+_STILL_M = 1e-3
 """A point that moves less than this over a whole trail [m] gets none."""
 _HIDDEN_LIGHT = 0.4
 """Brightness of what the camera does not see, against 1 for what it sees."""
 _LEGEND = (
-    "The bright yellow lines, which end in dots, are where the policy expected the points to go when it made its last "
-    f"plan, step by step; points that it expected to stay within {1000 * EXPECTED_M:.0f} mm have none. The flow error "
-    "is how far from there the points truly were at each step, on average over those that move more than "
-    f"{1000 * MOVES_M:.0f} mm under the plan."
+    "The bright yellow lines, which end in dots, are where the policy predicted the points to go when it made its last "
+    f"plan, step by step; points predicted to stay within {1000 * PREDICTED_M:.0f} mm have none. The flow error is how "
+    "far from there the points truly were at each step, on average over those that move more than "
+    f"{1000 * MOVING_M:.0f} mm under the plan."
 )
 
 
@@ -43,19 +43,19 @@ def write_rrd(
     """
     recording = rr.RecordingStream("flowlab")
     plans = [] if prediction is None else plan_predictions(episode, prediction)
-    off = list(errors(plans))
+    errors = list(prediction_errors(plans))
     temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with _strict():
-            recording.save(temporary, default_blueprint=layout(episode, flow_error=bool(off)))
+            recording.save(temporary, default_blueprint=make_blueprint(episode, flow_error=bool(errors)))
             recording.send_recording_name(name)
             for send in (_send_cloud, _send_tracks, _send_camera, _send_pictures, _send_object, _send_scalars):
                 send(recording, episode)
             if plans:
-                _send_forecasts(recording, episode, plans)
-            if off:
-                _send_flow_error(recording, episode, off)
+                _send_predictions(recording, episode, plans)
+            if errors:
+                _send_flow_error(recording, episode, errors)
             legend = f"\n\n{_LEGEND}" if plans else ""
             _send_info(recording, f"{about}\n\n{describe(episode)}{legend}")
             recording.disconnect()  # writes what is buffered, and the footer
@@ -92,7 +92,7 @@ def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
     colors = [cloud_rgb_at(episode, t) for t in steps]
     columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colors))
     recording.send_columns("/world/cloud", _times(episode), columns.partition([len(p) for p in points]))
-    recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * size(episode)), static=True)
+    recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * scene_size(episode)), static=True)
 
 
 def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
@@ -101,14 +101,14 @@ def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
     rgb = _shaded(track_rgb(episode), episode.tracks.visible[:, :M])
     columns = rr.Points3D.columns(positions=xyz_world.reshape(-1, 3), colors=rgb.reshape(-1, 3))
     recording.send_columns("/world/tracks/points", _times(episode), columns.partition([M] * T))
-    recording.log("/world/tracks/points", rr.Points3D.from_fields(radii=0.005 * size(episode)), static=True)
+    recording.log("/world/tracks/points", rr.Points3D.from_fields(radii=0.005 * scene_size(episode)), static=True)
 
     windows = [xyz_world[max(0, t - TRAIL_STEPS) : t + 1] for t in range(T)]
-    moved = np.array([np.linalg.norm(np.ptp(w, axis=0), axis=-1) > _STILL for w in windows])
+    moved = np.array([np.linalg.norm(np.ptp(w, axis=0), axis=-1) > _STILL_M for w in windows])
     strips = [w[:, k] for w, moving in zip(windows, moved, strict=True) for k in np.flatnonzero(moving)]
     lines = rr.LineStrips3D.columns(strips=strips, colors=rgb[moved])
     recording.send_columns("/world/tracks/trails", _times(episode), lines.partition(moved.sum(1)))
-    recording.log("/world/tracks/trails", rr.LineStrips3D.from_fields(radii=0.0012 * size(episode)), static=True)
+    recording.log("/world/tracks/trails", rr.LineStrips3D.from_fields(radii=0.0012 * scene_size(episode)), static=True)
 
 
 def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
@@ -116,30 +116,30 @@ def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -
     return (rgb * np.where(visible, 1.0, _HIDDEN_LIGHT)[..., None]).astype(np.uint8)
 
 
-def _send_forecasts(recording: rr.RecordingStream, episode: Episode, plans: Sequence[PlanPrediction]) -> None:
-    """The paths that each plan expects; one that expects none clears those of the plan before."""
-    drawn = [plan.expected_world[:, plan.predicted_moving].swapaxes(0, 1) for plan in plans]
+def _send_predictions(recording: rr.RecordingStream, episode: Episode, plans: Sequence[PlanPrediction]) -> None:
+    """The paths that each plan predicts; one that predicts none clears those of the plan before."""
+    drawn = [plan.predicted_world[:, plan.predicted_moving].swapaxes(0, 1) for plan in plans]
     times = _times(episode, [plan.step for plan in plans])
     counts = [len(paths) for paths in drawn]
     strips = rr.LineStrips3D.columns(strips=[path for paths in drawn for path in paths])
     ends = rr.Points3D.columns(positions=np.concatenate([paths[:, -1] for paths in drawn]))
     recording.send_columns("/world/predicted/paths", times, strips.partition(counts))
     recording.send_columns("/world/predicted/ends", times, ends.partition(counts))
-    thin, small = 0.0008 * size(episode), 0.0022 * size(episode)
+    thin, small = 0.0008 * scene_size(episode), 0.0022 * scene_size(episode)
     recording.log("/world/predicted/paths", rr.LineStrips3D.from_fields(radii=thin, colors=PREDICTED_RGB), static=True)
     recording.log("/world/predicted/ends", rr.Points3D.from_fields(radii=small, colors=PREDICTED_RGB), static=True)
 
 
 def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
     camera, T_world_cam = episode.camera, episode.camera.T_world_cam
-    axes = rr.ViewCoordinates.RDF if in_camera_frame(camera) else rr.ViewCoordinates.RIGHT_HAND_Z_UP
+    axes = rr.ViewCoordinates.RDF if world_is_camera_frame(camera) else rr.ViewCoordinates.RIGHT_HAND_Z_UP
     recording.log("/", axes, static=True)
     recording.log(CAMERA, rr.Transform3D(translation=T_world_cam[:3, 3], mat3x3=T_world_cam[:3, :3]), static=True)
     pinhole = rr.Pinhole(
         image_from_camera=camera.K,
         resolution=[camera.width, camera.height],
         camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=0.1 * size(episode),
+        image_plane_distance=0.1 * scene_size(episode),
     )
     recording.log(CAMERA, pinhole, static=True)
 
@@ -167,7 +167,7 @@ def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
     R_world_object = rotation_from_6d(episode.object_pose[:, 3:])
     columns = rr.Transform3D.columns(translation=episode.object_pose[:, :3], mat3x3=R_world_object)
     recording.send_columns("/world/object", _times(episode), columns)
-    recording.log("/world/object", rr.TransformAxes3D(0.08 * size(episode)), static=True)
+    recording.log("/world/object", rr.TransformAxes3D(0.08 * scene_size(episode)), static=True)
 
 
 def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
@@ -188,8 +188,8 @@ def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
             _send_line(recording, episode, f"quality/{key}", values, name=name, color=color)
 
 
-def _send_flow_error(recording: rr.RecordingStream, episode: Episode, off: Sequence[tuple[int, float]]) -> None:
-    steps, error = zip(*off, strict=True)
+def _send_flow_error(recording: rr.RecordingStream, episode: Episode, errors: Sequence[tuple[int, float]]) -> None:
+    steps, error = zip(*errors, strict=True)
     values, name = 1000 * np.array(error), "flow error [mm]"
     _send_line(recording, episode, "flow_error", values, name=name, color=PREDICTED_RGB, steps=steps)
 

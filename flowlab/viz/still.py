@@ -11,28 +11,25 @@ from matplotlib.figure import Figure
 from flowlab.records import Episode
 from flowlab.viz.captions import caption, moving
 from flowlab.viz.colors import SIGMA_LIMIT, cloud_rgb_at, role_rgb, sigma_rgb
+from flowlab.viz.orientation import is_upside_down, project_upright
 from flowlab.viz.panels import (
     LEFT,
-    QUIET,
     TIME_COLORS,
     SideView,
-    as_picture,
     dot,
     draw_cloud,
+    draw_legend,
     draw_time_bar,
-    fit,
-    legend,
-    panels,
+    fit_limits,
     role_dots,
-    save,
-    set_title,
-    trail,
+    style_as_picture,
+    trail_lines,
+    two_panels,
 )
-from flowlab.viz.upright import hangs, upright_pixels
+from flowlab.viz.plot_style import ALARM, QUIET, save_png, set_heading
 
 TRAILS_PER_ROLE = 24
 """More trails than this hide each other."""
-_ALARM = "#c2263b"
 
 
 def draw_still(episode: Episode, path: Path, *, title: str, note: str = "") -> None:
@@ -40,18 +37,18 @@ def draw_still(episode: Episode, path: Path, *, title: str, note: str = "") -> N
 
     ``note`` stands below the title, in red.
     """
-    save(compose(episode, title, note), path)
+    save_png(plot_still(episode, title, note), path)
 
 
-def compose(episode: Episode, title: str, note: str = "") -> Figure:
+def plot_still(episode: Episode, title: str, note: str = "") -> Figure:
     """The figure of :func:`draw_still`. Its first two axes are the camera's view, in pixels of the camera
     turned upright, and the side view, in meters of the world frame."""
-    figure, camera, side = panels(title, caption(episode, len(_drawn_trails(episode))))
+    figure, camera, side = two_panels(title, caption(episode, len(_drawn_trails(episode))))
     _draw_camera_view(camera, episode)
     _draw_side_view(side, episode)
     _draw_legend(figure, episode)
     draw_time_bar(figure, float(episode.time_s[-1]), "time [s]")
-    figure.text(LEFT, 0.91, shorten(note, 170, placeholder=" …"), fontsize=10, color=_ALARM, va="center")
+    figure.text(LEFT, 0.91, shorten(note, 170, placeholder=" …"), fontsize=10, color=ALARM, va="center")
     return figure
 
 
@@ -65,10 +62,11 @@ def _drawn_trails(episode: Episode) -> Int[np.ndarray, "K"]:
 def _draw_camera_view(axes: Axes, episode: Episode) -> None:
     cloud = episode.point_cloud[0, : episode.point_count[0]]
     depth = episode.camera.project(cloud)[1]
-    tracks = upright_pixels(episode.camera, episode.tracks.xyz_world[:, : episode.queries.count])
-    _draw_scene(axes, episode, upright_pixels(episode.camera, cloud), depth, tracks)
-    as_picture(axes)
-    set_title(axes, "first cloud and tracks, from the camera" + (" (turned upright)" if hangs(episode.camera) else ""))
+    tracks = project_upright(episode.camera, episode.tracks.xyz_world[:, : episode.queries.count])
+    _draw_scene(axes, episode, project_upright(episode.camera, cloud), depth, tracks)
+    style_as_picture(axes)
+    turned = " (turned upright)" if is_upside_down(episode.camera) else ""
+    set_heading(axes, f"first cloud and tracks, from the camera{turned}")
 
 
 def _draw_side_view(axes: Axes, episode: Episode) -> None:
@@ -76,28 +74,28 @@ def _draw_side_view(axes: Axes, episode: Episode) -> None:
     tracks = episode.tracks.xyz_world[:, : episode.queries.count]
     moves = moving(episode)
     view = SideView(episode.camera, tracks, tracks[:, moves] if moves.any() else tracks)
-    _draw_scene(axes, episode, view.project(cloud), view.away(cloud), view.project(tracks))
+    _draw_scene(axes, episode, view.project(cloud), view.depth(cloud), view.project(tracks))
     view.label(axes)
-    set_title(axes, f"the same, seen from {view.name}")
+    set_heading(axes, f"the same, seen from {view.name}")
 
 
 def _draw_scene(
     axes: Axes,
     episode: Episode,
     cloud: Float[np.ndarray, "P 2"],
-    away: Float[np.ndarray, "P"],
+    depth: Float[np.ndarray, "P"],
     tracks: Float[np.ndarray, "T M 2"],
 ) -> None:
     """The first cloud, far points first, and the tracks, in the plane of the axes."""
     margin = 0.0 if episode.tracks.quality is None else 0.5  # a point that got lost shall not shrink the rest
-    fit(axes, np.concatenate([cloud, tracks.reshape(-1, 2)]), margin)
-    draw_cloud(axes, cloud, away, cloud_rgb_at(episode, 0))
+    fit_limits(axes, np.concatenate([cloud, tracks.reshape(-1, 2)]), margin)
+    draw_cloud(axes, cloud, depth, cloud_rgb_at(episode, 0))
     still, drawn = ~moving(episode), _drawn_trails(episode)
     ink = _ink(episode)
     start, end = tracks[0].T, tracks[-1].T
     axes.scatter(start[0, still], start[1, still], 6, c=ink[still], linewidths=0, zorder=3)
     for k in drawn:
-        axes.add_collection(trail(tracks[:, k]), autolim=False)
+        axes.add_collection(trail_lines(tracks[:, k]), autolim=False)
     axes.scatter(start[0, drawn], start[1, drawn], 14, c="white", edgecolors=ink[drawn], linewidths=1, zorder=5)
     axes.scatter(end[0, drawn], end[1, drawn], 17, color=TIME_COLORS(1.0), edgecolors="white", linewidths=0.6, zorder=6)
 
@@ -116,4 +114,4 @@ def _draw_legend(figure: Figure, episode: Episode) -> None:
         names = [f"σ = {1000 * x:.0f} mm" for x in sigmas[:2]] + [f"≥ {1000 * SIGMA_LIMIT:.0f} mm"]
         dots = [dot(name, tuple(0.8 * sigma_rgb(x) / 255), "none") for name, x in zip(names, sigmas, strict=True)]
     dots += [dot("start", "white", QUIET), dot("end", TIME_COLORS(1.0), "none")]
-    legend(figure, dots)
+    draw_legend(figure, dots)

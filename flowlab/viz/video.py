@@ -1,4 +1,4 @@
-"""An episode as a film: its pictures, and where its tracks put the query points in them."""
+"""An episode as a video: its pictures, and where its tracks put the query points in them."""
 
 import os
 from collections.abc import Iterator
@@ -12,8 +12,8 @@ from flowlab.errors import DataError
 from flowlab.files import temporary_path
 from flowlab.records import Episode, FlowPrediction
 from flowlab.viz.caption_bar import CaptionBar
+from flowlab.viz.orientation import is_upside_down
 from flowlab.viz.overlay import Overlay
-from flowlab.viz.upright import hangs
 
 WIDTH = 640
 """Smaller pictures are enlarged, by a whole factor, to at least this width [px]: trails need room."""
@@ -42,11 +42,11 @@ def write_video(
     rate = Fraction(mean_fps(episode) if fps is None else fps).limit_denominator(1000)
     overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))), prediction)
     name, width = title or f"{episode.task}, seed {episode.seed}", pictures.scale * episode.camera.width
-    strip = CaptionBar(episode, width, name, note, predicted=prediction is not None)
+    bar = CaptionBar(episode, width, name, note, predicted=prediction is not None)
     temporary = temporary_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        _encode(temporary, rate, (_frame(pictures, overlay, strip, t) for t in range(len(episode))))
+        _encode(temporary, rate, (_frame(pictures, overlay, bar, t) for t in range(len(episode))))
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -71,7 +71,7 @@ class VideoFrames:
             )
         self._episode = episode
         self.scale = -(-WIDTH // episode.camera.width)
-        """Pixels of the film for one of the picture, each way."""
+        """Pixels of the video for one of the picture, each way."""
         self._near_far = _depth_range(episode)
 
     def draw(self, t: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -80,7 +80,7 @@ class VideoFrames:
 
         camera, rgb = self._episode.camera, self._episode.rgb
         picture = self._gray_depth(t) if rgb is None else rgb[t]
-        if hangs(camera):
+        if is_upside_down(camera):
             picture = picture[::-1, ::-1]
         size = camera.width * self.scale, camera.height * self.scale
         return np.asarray(cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -100,19 +100,19 @@ def _depth_range(episode: Episode) -> tuple[float, float]:
     return float(near), float(max(far, near + 1e-3))
 
 
-def _frame(pictures: VideoFrames, overlay: Overlay, strip: CaptionBar, t: int) -> UInt8[np.ndarray, "h w 3"]:
-    """One frame of the film, of even height and width, as yuv420p needs."""
+def _frame(pictures: VideoFrames, overlay: Overlay, bar: CaptionBar, t: int) -> UInt8[np.ndarray, "h w 3"]:
+    """One frame of the video, of even height and width, as yuv420p needs."""
     picture = pictures.draw(t)
     overlay.draw(picture, t)
-    frame = np.concatenate([picture, strip.draw(t)])
+    frame = np.concatenate([picture, bar.draw(t)])
     return np.pad(frame, [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)], mode="edge")
 
 
 def _encode(path: Path, rate: Fraction, frames: Iterator[UInt8[np.ndarray, "h w 3"]]) -> None:
     import av
 
-    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as film:
-        stream = film.add_stream("h264", rate=rate, options={"crf": "18"})
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("h264", rate=rate, options={"crf": "18"})
         stream.pix_fmt = "yuv420p"
         stream.colorspace = stream.color_primaries = stream.color_trc = _BT709
         for t, rgb in enumerate(frames):
@@ -121,5 +121,5 @@ def _encode(path: Path, rate: Fraction, frames: Iterator[UInt8[np.ndarray, "h w 
             frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
             frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709")
             frame.pts, frame.time_base = t, 1 / rate
-            film.mux(stream.encode(frame))
-        film.mux(stream.encode())
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())

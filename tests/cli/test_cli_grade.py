@@ -111,9 +111,9 @@ def test_tasks_are_simulated_once(tmp_path: Path, capsys: pytest.CaptureFixture[
         ((), UsageError, "nothing to grade; give folders .* or --tasks hammer,door-open"),
         ((*SMALL, "--tasks", "reach, hamer"), UsageError, "did you mean hammer"),
         (
-            ("--tasks", "hammer", "--tracker", "rigid-bodys"),
+            ("--tasks", "hammer", "--tracker", "rigid-body"),
             UsageError,
-            "no tracker is called 'rigid-bodys'; did you mean rigid-bodies",
+            "no tracker is called 'rigid-body'; did you mean rigid-bodies",
         ),
         (("--tasks", "hammer", "--size", "320"), UsageError, "--size 320: must look like 320x240"),
         (("--tasks", "hammer", "--chunk", "4"), UsageError, r"--chunk, --stride: stride \(8\) must be below length"),

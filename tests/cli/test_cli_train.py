@@ -193,7 +193,8 @@ def test_recordings_train_with_actions_that_are_places(tmp_path: Path, capsys: C
     table = tuple(Recorded(task="pour", name=f"take-{k}", seed=k, source=f"/rec/take-{k}") for k in range(4))
     about: dict[str, Any] = {"recording": {"reader": "plain"}, **SETTINGS, "track": {"tracker": "rigid-bodies"}}
     make_dataset(
-        tmp_path / "d", [[make_recorded(k) for k in range(4)]], settings=about, recordings=table, provenance=make_provenance(about, camera={}),
+        tmp_path / "d", [[make_recorded(k) for k in range(4)]], settings=about, recordings=table,
+        provenance=make_provenance(about, camera={}),
         recipe="real",
     )  # fmt: skip
     code, _, err = call_cli(capsys, "train", tmp_path / "d", "--policy", "fdp", "--out", tmp_path / "run", *SMALL)

@@ -15,7 +15,7 @@ from flowlab.data.source import open_training_source
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 FIRST = (0, 1, 2)
 PER_STEP = ("time_s", "point_cloud", "point_count", "state", "action", "success", "object_pose")
@@ -101,6 +101,6 @@ def test_a_state_of_two_numbers_has_no_place(tmp_path: Path) -> None:
 
 def test_of_a_store_in_dp3s_layout_nothing_is_known(tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[recorded(k) for k in range(3)]])
-    export_dp3(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
     source = open_training_source(tmp_path / "s.zarr")
     assert infer_channels(source, load_buffer(source, tmp_path)) == ChannelSpec()

@@ -16,7 +16,7 @@ from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 FIRST = (0, 1, 2)
 
@@ -154,7 +154,7 @@ def test_a_scene_in_which_nothing_moves_is_not_blown_up(tmp_path: Path, scale: s
 
 def test_without_flow_there_is_a_normalizer_too(tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[make_episode(k) for k in range(3)]])
-    export_dp3(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
     source = open_training_source(tmp_path / "s.zarr")
     settings = tiny_settings("dp3")
     found = fit_normalizer(source, load_buffer(source, tmp_path), ChannelSpec(), settings)

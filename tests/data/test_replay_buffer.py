@@ -17,7 +17,7 @@ from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.errors import DataError
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 
 def make_episodes() -> list[Episode]:
@@ -71,7 +71,7 @@ def test_a_corpus_is_its_dataset(tmp_path: Path) -> None:
 def test_a_corpus_without_poses_or_tracks_has_none(tmp_path: Path) -> None:
     episodes = [make_episode(k, object_pose=False) for k in range(3)]
     check(load_buffer(write(tmp_path / "d", episodes), tmp_path / "run"), episodes)
-    export_dp3(Dataset(tmp_path / "d"), tmp_path / "store.zarr")
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "store.zarr")
     buffer = load_buffer(open_training_source(tmp_path / "store.zarr"), tmp_path / "run")
     np.testing.assert_array_equal(buffer.action, np.concatenate([e.action for e in episodes]))
     assert [len(d) for d in buffer.episodes] == [len(e) for e in episodes]

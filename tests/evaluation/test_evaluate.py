@@ -86,7 +86,7 @@ def episodes(lines: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]
     return sorted((x["task"], x["seed"], x["episode"], x["scene_seed"]) for x in lines)
 
 
-def test_every_episode_is_there_once_with_its_layout(evaluated: Path) -> None:
+def test_every_episode_is_there_once_with_its_scene(evaluated: Path) -> None:
     lines = lines_of(evaluated)
     assert episodes(lines) == [(TASK, 0, k, 1_000_000 + k) for k in range(6)]
     for line in lines:
@@ -100,9 +100,9 @@ def test_every_episode_is_there_once_with_its_layout(evaluated: Path) -> None:
 def test_an_episode_is_what_the_policy_does_in_its_scene(evaluated: Path) -> None:
     """The checkpoint, tried in the scene its dataset was made in, gives the same line."""
     policy = load_policy(evaluated).policy
-    (attempt,) = roll_out(policy, SimulatorPool(TASK, SceneSettings()), [Trial(TASK, 0, 1)])
+    (episode,) = roll_out(policy, SimulatorPool(TASK, SceneSettings()), [Trial(TASK, 0, 1)])
     (line,) = [x for x in lines_of(evaluated) if x["episode"] == 1]
-    assert json.loads(attempt.outcome.model_dump_json(exclude_defaults=True)) == line
+    assert json.loads(episode.result.model_dump_json(exclude_defaults=True)) == line
 
 
 def test_any_number_of_workers_gives_the_same(fdp: Path, evaluated: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -157,7 +157,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(fdp: Path, evaluated: Path, tm
     assert leftovers(run) == []
 
 
-def test_policies_meet_the_same_layouts(evaluated: Path, dp3: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_policies_meet_the_same_scenes(evaluated: Path, dp3: Path, tmp_path: Path, capsys: Capture) -> None:
     runs = [copy(evaluated, tmp_path), copy(dp3, tmp_path)]
     before = in_order(runs[0])
     place = tmp_path / "report"
@@ -169,7 +169,7 @@ def test_policies_meet_the_same_layouts(evaluated: Path, dp3: Path, tmp_path: Pa
     assert [r["name"] for r in results] == ["fdp", "dp3"]
     tried = [episodes(r["evaluations"][0]["outcomes"]) for r in results]
     assert tried[0] == tried[1] == episodes(lines_of(runs[1])) == [(TASK, 0, k, 1_000_000 + k) for k in range(2)]
-    assert all("flow" not in x for x in lines_of(runs[1])), "it foresees nothing"
+    assert all("flow" not in x for x in lines_of(runs[1])), "it predicts none"
     files = {"report.html", "report.json", "report.csv", "episodes.csv"}
     assert {p.name for p in place.iterdir() if p.is_file()} == files
     assert (place / "episodes.csv").read_text().count("\n") == 5, "a line each, and one of names"
@@ -198,9 +198,9 @@ def test_a_single_step_of_every_plan_is_executed(fdp: Path, tmp_path: Path, caps
     if "flow" in line:
         assert line["flow"]["pairs"] == line["flow"]["ends"], "of a single step, the mean is the end"
     policy = load_policy(run).policy
-    (attempt,) = roll_out(policy, SimulatorPool(TASK, SceneSettings()), [Trial(TASK, 0, 0)], n_action_steps=1)
-    assert attempt.outcome.steps == line["steps"]
-    assert len(attempt.predicted) == len(attempt.rollout)
+    (episode,) = roll_out(policy, SimulatorPool(TASK, SceneSettings()), [Trial(TASK, 0, 0)], n_action_steps=1)
+    assert episode.result.steps == line["steps"]
+    assert len(episode.predicted) == len(episode.rollout)
 
 
 def test_checkpoints_make_a_curve(fdp: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -232,7 +232,7 @@ WRONG: dict[str, tuple[list[str], int, str]] = {
     "seeds that are none": (["--seeds", "0,x"], 2, "--seeds 0,x: must be whole numbers, as in --seeds 0,1,2"),
     "no seeds": (["--seeds", ","], 2, "--seeds ,: must be whole numbers"),
     "negative seed": (["--seeds=-1"], 2, "--seeds -1: must be whole numbers"),
-    "seed without layouts": (["--seeds", "0,4000"], 2, "seed 4000: evaluation seeds are from 0 to 3999"),
+    "seed without scenes": (["--seeds", "0,4000"], 2, "seed 4000: evaluation seeds are from 0 to 3999"),
     "more than is planned": (["--execute", "16"], 2, "plans 15 steps ahead, so execute 1 to 15"),
     "data for a simulation": (["--data", "d"], 2, "--data is about held-out demonstrations; add --offline"),
     "films of no episodes": (
@@ -304,7 +304,7 @@ def test_runs_without_a_common_task(fdp: Path, tmp_path: Path, capsys: Capture) 
 
 @pytest.fixture
 def elsewhere(tmp_path: Path, capsys: Capture) -> Path:
-    """A run on a demonstration of layout 1,000,000, seen by a smaller camera."""
+    """A run on a demonstration of scene 1,000,000, seen by a smaller camera."""
     scene = options("first_seed=1000000", "expert.scene.camera.width=96", "expert.scene.camera.height=96")
     command = ("extract-sim", TASK, "--episodes", "1", "--workers", "1", "--out", tmp_path / "d")
     code, _, err = call_cli(capsys, *command, *scene)
@@ -312,21 +312,21 @@ def elsewhere(tmp_path: Path, capsys: Capture) -> Path:
     return trained(tmp_path / "d", tmp_path, "fdp")
 
 
-def test_layouts_that_were_demonstrated_are_refused(elsewhere: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_scenes_that_were_demonstrated_are_refused(elsewhere: Path, tmp_path: Path, capsys: Capture) -> None:
     """A dataset may begin anywhere; evaluation numbers begin at 1,000,000. What is left is seen as it was there."""
     assert policy_of(elsewhere)["scene_seeds"] == {TASK: [1_000_000]}
     before = files_below(tmp_path)
     code, err = refused(capsys, elsewhere, "--episodes", "2")
     assert code == 2
-    assert f"{elsewhere}: its dataset holds the layout 1000000 of {TASK}, which evaluation seed 0 would try" in err
+    assert f"{elsewhere}: its dataset holds the scene 1000000 of {TASK}, which evaluation seed 0 would try" in err
     assert files_below(tmp_path) == before
     evaluate(capsys, elsewhere, "--episodes", "1", "--seeds", "1", "--workers", "1")
     (line,) = lines_of(elsewhere)
     assert episodes([line]) == [(TASK, 1, 0, 2_000_000)]
     policy, same = load_policy(elsewhere).policy, []
     for scene in (SceneSettings(camera=CameraSettings(width=96, height=96)), SceneSettings()):
-        (attempt,) = roll_out(policy, SimulatorPool(TASK, scene), [Trial(TASK, 1, 0)])
-        same.append(json.loads(attempt.outcome.model_dump_json(exclude_defaults=True)) == line)
+        (episode,) = roll_out(policy, SimulatorPool(TASK, scene), [Trial(TASK, 1, 0)])
+        same.append(json.loads(episode.result.model_dump_json(exclude_defaults=True)) == line)
     assert same == [True, False]
 
 

@@ -11,11 +11,13 @@ from builders import tiny_settings, tiny_spec
 from synthetic import assert_same
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.evaluation.rollout import BATCH_SLOTS, Attempt, SimulatorPool, roll_out
+from flowlab.evaluation.rollout import BATCH_SLOTS, PolicyRollout, SimulatorPool, roll_out
 from flowlab.evaluation.trials import SCENES_PER_SEED, Trial
 from flowlab.perception.observer import Box, ObserverSettings
 from flowlab.perception.queries import QuerySettings
 from flowlab.policies.base import ActionPlan, Generators, PolicyNetwork
+from flowlab.policies.dp3 import DP3
+from flowlab.policies.fdp import FDP
 from flowlab.records import Episode, Frame
 from flowlab.sim.recorder import EpisodeRecorder, ExpertSettings, TaskSimulator
 from flowlab.sim.simulation import SceneSettings
@@ -38,14 +40,14 @@ class Seen:
     contexts: list[ObservationBatch] = field(default_factory=list)
 
 
-class Repeater(PolicyNetwork):
-    """Plans given actions, and remembers what the first lane was shown."""
+class Repeater(DP3):
+    """Plans given actions, and remembers what the first slot was shown."""
 
-    def follow(self, action: np.ndarray, n_action_steps: int) -> Seen:
+    def repeat(self, action: np.ndarray, n_action_steps: int) -> Seen:
         self.demonstrated, self.n_action_steps, self.seen = torch.from_numpy(action), n_action_steps, Seen()
         return self.seen
 
-    def plan(self, context: ObservationBatch, noise_from: Generators = None) -> ActionPlan:
+    def plan(self, context: ObservationBatch, generators: Generators = None) -> ActionPlan:
         s = self.spec.settings
         first = self.n_action_steps * len(self.seen.contexts) - (s.n_obs_steps - 1)
         self.seen.contexts.append(context)
@@ -62,22 +64,21 @@ def spec_values(task: str, queries: int = 20, **observer: Any) -> dict[str, Any]
 
 
 def repeater(name: str, task: str, history: int = 2, **observer: Any) -> Repeater:
-    settings = tiny_settings(
-        name, f"horizon={HORIZON}", "n_action_steps=8", "encoder.points=1024", f"n_obs_steps={history}"
-    )
+    changes = [f"horizon={HORIZON}", "n_action_steps=8", "encoder.points=1024", f"n_obs_steps={history}"]
+    settings = tiny_settings(name, *changes, *(["motion.points=20"] if name == "fdp" else []))
     return Repeater(tiny_spec(settings, **spec_values(task, **observer)))
 
 
 def demonstrated(episode: Episode) -> Trial:
-    """The trial whose layout is that of a demonstration; no evaluation has it."""
+    """The trial whose scene is that of a demonstration; no evaluation has it."""
     trial = Trial(episode.task, -1, episode.seed)
     assert trial.scene_seed == episode.seed
     return trial
 
 
-def only(attempts: Sequence[Attempt]) -> Attempt:
-    (attempt,) = attempts
-    return attempt
+def only(episodes: Sequence[PolicyRollout]) -> PolicyRollout:
+    (episode,) = episodes
+    return episode
 
 
 @pytest.mark.parametrize(
@@ -89,15 +90,15 @@ def test_repeating_the_expert_solves_the_task_at_the_same_step_and_shows_the_dat
 ) -> None:
     """Every plan looks at the frames up to its own step, bit for bit as the dataset has them."""
     policy = repeater(name, "hammer", history)
-    seen = policy.follow(hammer_episode.action, n_action_steps)
-    attempt = only([*roll_out(policy, hammer, [demonstrated(hammer_episode)], n_action_steps=n_action_steps)])
-    assert attempt.outcome.success
+    seen = policy.repeat(hammer_episode.action, n_action_steps)
+    episode = only([*roll_out(policy, hammer, [demonstrated(hammer_episode)], n_action_steps=n_action_steps)])
+    assert episode.result.success
     solved = int(np.flatnonzero(hammer_episode.success)[0]) + 1
-    assert attempt.outcome.steps == solved
-    steps = len(attempt.rollout)
+    assert episode.result.steps == solved
+    steps = len(episode.rollout)
     assert len(seen.contexts) == -(-steps // n_action_steps)
-    np.testing.assert_array_equal(attempt.rollout.action, hammer_episode.action[:steps])
-    np.testing.assert_array_equal(attempt.rollout.state, hammer_episode.state[:steps])
+    np.testing.assert_array_equal(episode.rollout.action, hammer_episode.action[:steps])
+    np.testing.assert_array_equal(episode.rollout.state, hammer_episode.state[:steps])
     queries = hammer_episode.queries.xyz_world[: 20 if name == "fdp" else 0]
     for k, context in enumerate(seen.contexts):
         rows = [max(n_action_steps * k - back, 0) for back in reversed(range(history))]
@@ -110,8 +111,8 @@ def test_repeating_the_expert_solves_the_task_at_the_same_step_and_shows_the_dat
 
 def test_a_policy_that_does_nothing_runs_out_of_steps(hammer: SimulatorPool) -> None:
     policy = repeater("dp3", "hammer")
-    seen = policy.follow(np.zeros((1, 4), np.float32), 8)
-    outcome = only([*roll_out(policy, hammer, [Trial("hammer", 0, 4)], max_steps=19)]).outcome
+    seen = policy.repeat(np.zeros((1, 4), np.float32), 8)
+    outcome = only([*roll_out(policy, hammer, [Trial("hammer", 0, 4)], max_steps=19)]).result
     assert (outcome.task, outcome.seed, outcome.episode, outcome.scene_seed) == ("hammer", 0, 4, 1_000_004)
     assert (outcome.success, outcome.success_dp3, outcome.steps, outcome.note) == (False, False, 19, "")
     assert len(seen.contexts) == 3
@@ -120,7 +121,7 @@ def test_a_policy_that_does_nothing_runs_out_of_steps(hammer: SimulatorPool) -> 
 def test_actions_are_clipped(hammer: SimulatorPool) -> None:
     """As the expert's are; MetaWorld would take more."""
     policy = repeater("dp3", "hammer")
-    policy.follow(np.array([[3.0, -2.0, 0.5, 9.0]], np.float32), 8)
+    policy.repeat(np.array([[3.0, -2.0, 0.5, 9.0]], np.float32), 8)
     rollout = only([*roll_out(policy, hammer, [Trial("hammer", 0, 0)], max_steps=3)]).rollout
     np.testing.assert_array_equal(rollout.action, [[1, -1, 0.5, 1]] * 3)
 
@@ -162,15 +163,15 @@ def test_a_success_counts_whenever_it_was_and_for_dp3_only_at_the_end_of_a_plan(
     for n_action_steps in (1, 2, 3, 7, 8, first, first + 1, first + solved_steps, first + solved_steps + 1, missed):
         assert 1 <= n_action_steps < HORIZON
         policy = repeater("dp3", "reach")
-        policy.follow(action, n_action_steps)
-        attempt = only([*roll_out(policy, reach, [trial], n_action_steps=n_action_steps, max_steps=len(success))])
-        outcome, length = attempt.outcome, len(attempt.rollout)
+        policy.repeat(action, n_action_steps)
+        episode = only([*roll_out(policy, reach, [trial], n_action_steps=n_action_steps, max_steps=len(success))])
+        outcome, length = episode.result, len(episode.rollout)
         end = read_as_dp3_does(success, n_action_steps)
         assert outcome.success
         assert outcome.steps == first
         assert outcome.success_dp3 == (end is not None), n_action_steps
         assert length == (end or len(success)), "it goes on until both agree"
-        assert attempt.rollout.success.tolist() == success[:length]
+        assert episode.rollout.success.tolist() == success[:length]
         kinds.add(outcome.success_dp3)
     assert kinds == {True, False}
 
@@ -179,18 +180,18 @@ def noisy() -> PolicyNetwork:
     """A policy that has learned nothing: its actions come of its noise."""
     torch.manual_seed(0)
     settings, values = tiny_settings("fdp", "encoder.points=64"), spec_values("hammer", 6, points=64)
-    return PolicyNetwork(tiny_spec(settings, **{**values, "tasks": ("assembly", "hammer")})).eval()
+    return FDP(tiny_spec(settings, **{**values, "tasks": ("assembly", "hammer")})).eval()
 
 
-def by_trial(attempts: Sequence[Attempt]) -> dict[Trial, Attempt]:
-    found = {a.outcome.trial: a for a in attempts}
-    assert len(found) == len(attempts)
+def by_trial(episodes: Sequence[PolicyRollout]) -> dict[Trial, PolicyRollout]:
+    found = {a.result.trial: a for a in episodes}
+    assert len(found) == len(episodes)
     return found
 
 
-def assert_same_attempt(a: Attempt, b: Attempt) -> None:
+def assert_same_episode(a: PolicyRollout, b: PolicyRollout) -> None:
     """To the last bit."""
-    assert a.outcome == b.outcome
+    assert a.result == b.result
     for name in ("action", "state", "success", "object_pose"):
         assert_same(getattr(a.rollout, name), getattr(b.rollout, name), name)
     assert a.rollout.extras == b.rollout.extras
@@ -212,8 +213,8 @@ def test_an_episode_is_the_same_whatever_is_tried_beside_it(hammer: SimulatorPoo
     fresh = SimulatorPool("hammer", SceneSettings())
     alone = by_trial([only([*roll_out(policy, fresh, [t], max_steps=12)]) for t in (wanted[6], wanted[4])])
     for others in (reverse, some, alone):
-        for trial, attempt in others.items():
-            assert_same_attempt(attempt, together[trial])
+        for trial, episode in others.items():
+            assert_same_episode(episode, together[trial])
     actions = {a.rollout.action.tobytes() for a in together.values()}
     scene_seeds = {tuple(a.rollout.extras["rand_vec"]) for a in together.values()}
     assert len(actions) == len(scene_seeds) == len(wanted)
@@ -224,11 +225,11 @@ def test_noise_is_the_trials_own(hammer: SimulatorPool) -> None:
     policy = noisy()
     noise: list[torch.Tensor] = []
 
-    class Listener(PolicyNetwork):
-        def plan(self, context: ObservationBatch, noise_from: Generators = None) -> ActionPlan:
-            assert isinstance(noise_from, Sequence)
-            noise.append(torch.stack([torch.randn(7, generator=g) for g in noise_from]))
-            return policy.plan(context, noise_from)
+    class Listener(FDP):
+        def plan(self, context: ObservationBatch, generators: Generators = None) -> ActionPlan:
+            assert isinstance(generators, Sequence)
+            noise.append(torch.stack([torch.randn(7, generator=g) for g in generators]))
+            return policy.plan(context, generators)
 
     wanted = [Trial("hammer", 2, 1), Trial("hammer", 2, 3)]
     assert len([*roll_out(Listener(policy.spec), hammer, wanted, max_steps=4)]) == 2
@@ -250,27 +251,29 @@ def test_only_what_a_plan_looks_at_is_taken_and_that_changes_nothing(
         return take(live)
 
     monkeypatch.setattr(EpisodeRecorder, "frame", frame)
-    attempt = only([*roll_out(policy, hammer, [trial], n_action_steps=n_action_steps, max_steps=12)])
+    episode = only([*roll_out(policy, hammer, [trial], n_action_steps=n_action_steps, max_steps=12)])
     assert taken[: len(looked_at)] == looked_at
     assert set(taken) <= {*looked_at, 12}
     taken.clear()
-    always = only([*roll_out(policy, hammer, [trial], n_action_steps=n_action_steps, max_steps=12, look_always=True)])
+    always = only(
+        [*roll_out(policy, hammer, [trial], n_action_steps=n_action_steps, max_steps=12, render_every_step=True)]
+    )
     assert taken[:12] == [*range(12)]
-    assert_same_attempt(attempt, always)
+    assert_same_episode(episode, always)
 
 
-def test_what_was_foreseen_is_the_plans_flow_from_the_present_on(hammer: SimulatorPool) -> None:
+def test_what_was_predicted_is_the_plans_flow_from_the_present_on(hammer: SimulatorPool) -> None:
     policy = repeater("fdp", "hammer", history=3)
-    policy.follow(np.zeros((1, 4), np.float32), 8)
+    policy.repeat(np.zeros((1, 4), np.float32), 8)
     flow = torch.arange(BATCH_SLOTS * HORIZON * 20 * 3, dtype=torch.float32).view(BATCH_SLOTS, HORIZON, 20, 3)
 
     class Prophet(Repeater):
-        def plan(self, context: ObservationBatch, noise_from: Generators = None) -> ActionPlan:
-            return ActionPlan(policy.plan(context, noise_from).action, flow)
+        def plan(self, context: ObservationBatch, generators: Generators = None) -> ActionPlan:
+            return ActionPlan(policy.plan(context, generators).action, flow)
 
-    attempt = only([*roll_out(Prophet(policy.spec), hammer, [Trial("hammer", 0, 2)], max_steps=20)])
-    assert [step for step, _ in attempt.predicted] == [0, 8, 16]
-    for _, prediction in attempt.predicted:
+    episode = only([*roll_out(Prophet(policy.spec), hammer, [Trial("hammer", 0, 2)], max_steps=20)])
+    assert [step for step, _ in episode.predicted] == [0, 8, 16]
+    for _, prediction in episode.predicted:
         np.testing.assert_array_equal(prediction, flow[2, 2:])
 
 
@@ -282,30 +285,30 @@ def test_a_view_that_becomes_empty_fails_the_episode_and_says_why(reach: Simulat
     """The crop holds the hand only where it begins, and it goes up."""
     low, high = ([x + s * d for x, d in zip(HAND, (0.06, 0.06, 0.05), strict=True)] for s in (-1, 1))
     policy = repeater("dp3", "reach", crop=Box(low=tuple(low), high=tuple(high)))
-    seen = policy.follow(np.array([[0, 0, 1, 0]], np.float32), 8)
-    attempt = only([*roll_out(policy, reach, [Trial("reach", 0, 0)])])
-    outcome = attempt.outcome
+    seen = policy.repeat(np.array([[0, 0, 1, 0]], np.float32), 8)
+    episode = only([*roll_out(policy, reach, [Trial("reach", 0, 0)])])
+    outcome = episode.result
     assert "no point of the frame lies in the crop" in outcome.note
     assert (outcome.success, outcome.success_dp3) == (False, False)
     assert 1 <= len(seen.contexts) < 200 // 8
-    assert outcome.steps == len(attempt.rollout) < 200
+    assert outcome.steps == len(episode.rollout) < 200
 
 
 def test_a_first_view_that_is_empty_fails_the_episode_too(reach: SimulatorPool) -> None:
     """And the others go on."""
     policy = repeater("dp3", "reach", crop=Box(low=(5, 5, 5), high=(6, 6, 6)))
-    policy.follow(np.zeros((1, 4), np.float32), 8)
+    policy.repeat(np.zeros((1, 4), np.float32), 8)
     wanted = [Trial("reach", 0, 0), Trial("reach", 0, 4), Trial("reach", 0, 1)]
-    outcomes = [a.outcome for a in roll_out(policy, reach, wanted)]
+    outcomes = [a.result for a in roll_out(policy, reach, wanted)]
     assert {o.trial for o in outcomes} == set(wanted)
     for outcome in outcomes:
         assert "no point of the frame lies in the crop" in outcome.note
         assert (outcome.success, outcome.success_dp3, outcome.flow) == (False, False, None)
 
 
-def test_a_stage_makes_a_simulation_once() -> None:
-    stage = SimulatorPool("reach", SceneSettings())
-    first = stage.simulator(1)
-    assert stage.simulator(1) is first
-    assert stage.simulator(2) is not first
+def test_a_pool_makes_a_simulator_once() -> None:
+    pool = SimulatorPool("reach", SceneSettings())
+    first = pool.simulator(1)
+    assert pool.simulator(1) is first
+    assert pool.simulator(2) is not first
     assert isinstance(first, TaskSimulator)

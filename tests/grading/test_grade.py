@@ -14,15 +14,13 @@ from flowlab.errors import DataError, MissingLibraryError
 from flowlab.geometry.camera import Camera
 from flowlab.grading import grade as grading
 from flowlab.grading import ground_truth
-from flowlab.grading.grade import grade, grade_recording, read_clip
-from flowlab.grading.ground_truth import GroundTruth
+from flowlab.grading.grade import grade_recording, grade_tracker, read_clip
+from flowlab.grading.ground_truth import MADE_WITH, GroundTruth, unusable_queries
 from flowlab.grading.simulate import (
-    MADE_WITH,
     UNUSABLE_M,
     QueryMix,
     SimulatedRecording,
     simulate_recording,
-    unusable_queries,
 )
 from flowlab.perception.observer import Box, ObserverSettings
 from flowlab.pipeline.stages.simulation import ExpertStage
@@ -110,7 +108,7 @@ def off_by(truth: GroundTruth, meters: float) -> Label:
     return lambda *_: (truth.tracks_cam - np.float32([0, 0, meters]), truth.visible, sigma)
 
 
-def grade_one(recording: Path) -> grading.Grade:
+def grade_one(recording: Path) -> grading.RecordingGrade:
     return grade_recording(recording, Still(), ChunkSettings(), LiftSettings())
 
 
@@ -235,7 +233,9 @@ def test_grades_average_recordings_and_pool_calibration(
 ) -> None:
     answer(held)
     told: list[str] = []
-    grades = grade([clean, noisy], Still(), ChunkSettings(), LiftSettings(), report=lambda g: told.append(g.recording))
+    grades = grade_tracker(
+        [clean, noisy], Still(), ChunkSettings(), LiftSettings(), report=lambda g: told.append(g.recording)
+    )
     assert told == ["door-open-0", "noisy"]
     one, two = (g.metrics for g in grades.rows)
     assert one != two

@@ -12,19 +12,10 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import spearmanr
 
 from flowlab.geometry.camera import Camera
+from flowlab.grading.calibration import SIGMA_EDGES_MM, calibrate, rank_correlation
 from flowlab.grading.ground_truth import GroundTruth
-from flowlab.grading.metrics import (
-    CURVE_MM,
-    SIGMA_EDGES_MM,
-    Estimate,
-    MetricSettings,
-    TrackErrors,
-    TrackMetrics,
-    average,
-    calibrate,
-    measure,
-    rank_correlation,
-)
+from flowlab.grading.metrics import CURVE_MM, EstimatedTracks, TrackErrors, TrackMetrics, average, measure
+from flowlab.grading.tapvid import MetricSettings
 from flowlab.records import Role
 
 CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 270, 120], [0, 0, 1]]), np.eye(4))
@@ -42,7 +33,7 @@ def make_truth(seed: int = 0, steps: int = 12, points: int = 9) -> GroundTruth:
     return GroundTruth(np.zeros((points, 2), np.float32), tracks.astype(np.float32), visible, role)
 
 
-def make_estimate(truth: GroundTruth, seed: int = 0, scale_m: float = 0.02) -> Estimate:
+def make_estimate(truth: GroundTruth, seed: int = 0, scale_m: float = 0.02) -> EstimatedTracks:
     """Errors of all sizes, wrong visibility here and there, some answers missing."""
     rng = np.random.default_rng(seed + 1)
     size = scale_m * rng.lognormal(0, 1.5, truth.visible.shape)
@@ -50,11 +41,13 @@ def make_estimate(truth: GroundTruth, seed: int = 0, scale_m: float = 0.02) -> E
     xyz = truth.tracks_cam + size[..., None] * direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     xyz[rng.random(truth.visible.shape) < 0.05] = np.nan
     visible = truth.visible ^ (rng.random(truth.visible.shape) < 0.2)
-    return Estimate(xyz.astype(np.float32), visible, (size * rng.lognormal(0, 0.5, size.shape)).astype(np.float32))
+    return EstimatedTracks(
+        xyz.astype(np.float32), visible, (size * rng.lognormal(0, 0.5, size.shape)).astype(np.float32)
+    )
 
 
 def tapvid_in_loops(
-    estimate: Estimate, truth: GroundTruth, focal_px: float, first: int = 0
+    estimate: EstimatedTracks, truth: GroundTruth, focal_px: float, first: int = 0
 ) -> tuple[float, float, float]:
     """3D-AJ, APD and OA as the paper words them, one pair at a time. ``focal_px`` is that at 256 pixels."""
     steps, points = truth.visible.shape
@@ -78,10 +71,10 @@ def tapvid_in_loops(
     return sum(jaccards) / 5, sum(shares) / 5, sum(agree) / len(agree)
 
 
-def off_by(truth: GroundTruth, error_mm: Any, *, visible: np.ndarray | None = None) -> Estimate:
+def off_by(truth: GroundTruth, error_mm: Any, *, visible: np.ndarray | None = None) -> EstimatedTracks:
     """An estimate that is off along x by (T, N) millimeters."""
     shift = np.broadcast_to(np.asarray(error_mm, float), truth.visible.shape)[..., None] * [1e-3, 0, 0]
-    return Estimate((truth.tracks_cam + shift).astype(np.float32), truth.visible if visible is None else visible)
+    return EstimatedTracks((truth.tracks_cam + shift).astype(np.float32), truth.visible if visible is None else visible)
 
 
 def still(points: int, steps: int, role: Role | None = Role.OBJECT) -> GroundTruth:
@@ -93,7 +86,7 @@ def still(points: int, steps: int, role: Role | None = Role.OBJECT) -> GroundTru
 
 def test_perfect_tracks_are_perfect() -> None:
     truth = make_truth()
-    m = measure(Estimate(truth.tracks_cam, truth.visible), truth, CAMERA)
+    m = measure(EstimatedTracks(truth.tracks_cam, truth.visible), truth, CAMERA)
     assert (m.tapvid.average_jaccard, m.tapvid.apd, m.tapvid.occlusion_accuracy) == (1, 1, 1)
     assert m.survival == m.survival_moving == 1
     for group in (m.all, m.moving, m.object, m.occluded):
@@ -272,7 +265,7 @@ def test_what_holds_for_any_tracks(seed: int) -> None:
     assert truth.role is not None
     assert estimate.sigma is not None
     shuffled = measure(
-        Estimate(estimate.xyz_cam[:, order], estimate.visible[:, order], estimate.sigma[:, order]),
+        EstimatedTracks(estimate.xyz_cam[:, order], estimate.visible[:, order], estimate.sigma[:, order]),
         GroundTruth(truth.query_px, truth.tracks_cam[:, order], truth.visible[:, order], truth.role[order]),
         CAMERA,
     )

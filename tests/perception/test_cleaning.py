@@ -1,4 +1,4 @@
-"""Tables and stray points are removed, and nothing else: scenes made by hand, so what belongs to what is known."""
+"""Tables and outliers are removed, and nothing else: scenes made by hand, so what belongs to what is known."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flowlab.errors import MissingLibraryError
 from flowlab.geometry.camera import Camera
-from flowlab.perception.cleaning import OutlierSettings, TableSettings, above_table, not_stray
+from flowlab.perception.cleaning import OutlierSettings, TableSettings, outlier_mask, table_mask
 from flowlab.perception.observer import Box, Observer, ObserverSettings
 from flowlab.records import Frame
 
@@ -36,7 +36,7 @@ def scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def test_what_stands_on_the_table_stays_and_the_rest_goes_wherever_the_table_is(seed: int) -> None:
     xyz, kind = scene(seed)
     turn, shift = Rotation.random(random_state=seed), np.random.default_rng(seed).uniform(-1, 1, 3)
-    kept = above_table(
+    kept = ~table_mask(
         (turn.apply(xyz) + shift).astype(np.float32), turn.apply(EYE) + shift, TableSettings(distance_m=0.01)
     )
     np.testing.assert_array_equal(kept, kind == 1)
@@ -47,36 +47,36 @@ def test_the_distance_is_how_far_above_the_table_things_begin() -> None:
     rng = np.random.default_rng(0)
     table = np.append(rng.uniform(-0.4, 0.4, (3000, 2)), np.zeros((3000, 1)), 1)
     levels = np.array([[0, 0, z] for z in (0.004, 0.019, 0.021, 0.3)])
-    kept = above_table(np.concatenate([table, levels]), EYE, TableSettings(distance_m=0.02))
+    kept = ~table_mask(np.concatenate([table, levels]), EYE, TableSettings(distance_m=0.02))
     assert kept[-4:].tolist() == [False, False, True, True]
 
 
 def test_the_same_cloud_gives_the_same_table() -> None:
     """Few trials and no plane in it: chance decides, and the seed decides on chance."""
     xyz = np.random.default_rng(1).uniform(-1, 1, (2000, 3))
-    found = [above_table(xyz, EYE, TableSettings(trials=3, min_share=0, seed=s)) for s in (4, 4, 5)]
+    found = [table_mask(xyz, EYE, TableSettings(trials=3, min_share=0, seed=s)) for s in (4, 4, 5)]
     np.testing.assert_array_equal(found[0], found[1])
     assert (found[0] != found[2]).any()
 
 
 def test_a_scene_without_a_table_keeps_everything() -> None:
     xyz = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
-    assert above_table(xyz, EYE, TableSettings()).all()
-    assert not above_table(xyz, EYE, TableSettings(min_share=0.0)).all()
+    assert not table_mask(xyz, EYE, TableSettings()).any()
+    assert table_mask(xyz, EYE, TableSettings(min_share=0.0)).any()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_clouds_too_small_for_a_plane_are_kept(count: int) -> None:
-    assert above_table(np.zeros((count, 3), np.float32), EYE, TableSettings()).all()
-    assert len(not_stray(np.zeros((count, 3), np.float32), OutlierSettings())) == count
+    assert not table_mask(np.zeros((count, 3), np.float32), EYE, TableSettings()).any()
+    assert len(outlier_mask(np.zeros((count, 3), np.float32), OutlierSettings())) == count
 
 
 @pytest.mark.parametrize(("neighbors", "std_ratio"), [(3, 0.2), (12, 1.5)])
-def test_stray_points_go_by_the_rule_that_is_stated(neighbors: int, std_ratio: float) -> None:
+def test_outliers_go_by_the_rule_that_is_stated(neighbors: int, std_ratio: float) -> None:
     """The mean distance to the nearest neighbors, against its mean and deviation over the cloud."""
     rng = np.random.default_rng(3)
     xyz = np.concatenate([rng.normal(0, 0.05, (2000, 3)), rng.uniform(-2, 2, (40, 3))])
-    kept = not_stray(xyz, OutlierSettings(neighbors=neighbors, std_ratio=std_ratio))
+    kept = ~outlier_mask(xyz, OutlierSettings(neighbors=neighbors, std_ratio=std_ratio))
     distance = np.asarray(cKDTree(xyz).query(xyz, k=neighbors)[0]).mean(1)  # Open3D counts the point itself
     np.testing.assert_array_equal(kept, distance < distance.mean() + std_ratio * distance.std(ddof=1))
     assert kept[:2000].mean() > 0.9
@@ -126,7 +126,7 @@ def test_options_are_switched_on_and_off_in_words() -> None:
 def test_where_open3d_cannot_be_loaded_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingLibraryError, match=r"apt-get install libusb-1\.0-0"):
-        not_stray(np.zeros((9, 3)), OutlierSettings())
+        outlier_mask(np.zeros((9, 3)), OutlierSettings())
 
 
 def test_open3d_is_not_loaded_unless_it_is_needed() -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from flowlab.engines.local import LocalEngine, UnitResult
+from flowlab.engines.base import UnitResult
+from flowlab.engines.local import LocalEngine
 from flowlab.errors import DataError
 from flowlab.pipeline.units import WorkUnit
 from flowlab.storage.manifest import Receipt

@@ -165,7 +165,7 @@ def test_what_was_rejected_with_its_episode_can_be_looked_at(tmp_path: Path) -> 
     (tmp_path / "receipts").mkdir()
     unit = WorkUnit(task="roll", seeds=(0, 1, 2, 3), sources=("/a", "/b", "/c", "/d"))
     begin(tmp_path, make_manifest({"roll": 4}))
-    receipt = run_unit(STAGES_HERE % "Kept", "digest", tmp_path, unit)
+    receipt = run_unit(STAGES_HERE % "Kept", None, "digest", tmp_path, unit)
     assert receipt.accepted == (0, 2)
     assert [(x.seed, x.stage, x.reason, x.source, x.position) for x in receipt.rejects] == [
         (1, "test_pipeline:Kept", "1 is odd", "/b", 0), (3, "test_pipeline:Kept", "3 is odd", "/d", 1),
@@ -180,11 +180,11 @@ def test_a_second_try_at_a_unit_leaves_nothing_of_the_first(tmp_path: Path) -> N
     """Its recording was mended, or its rules were changed: a shard that its receipt knows nothing of must not stay."""
     (tmp_path / "receipts").mkdir()
     unit = WorkUnit(task="roll", seeds=(1,))
-    run_unit(STAGES_HERE % "Kept", "digest", tmp_path, unit)
+    run_unit(STAGES_HERE % "Kept", None, "digest", tmp_path, unit)
     assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["rejects"]
-    run_unit(STAGES_HERE % "AsItIs", "digest", tmp_path, unit)
+    run_unit(STAGES_HERE % "AsItIs", None, "digest", tmp_path, unit)
     assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["shards"]
-    run_unit(STAGES_HERE % "OnlyEven", "digest", tmp_path, unit)
+    run_unit(STAGES_HERE % "OnlyEven", None, "digest", tmp_path, unit)
     assert list(tmp_path.glob("*/*.zarr")) == []
 
 
@@ -243,7 +243,8 @@ def test_simulation_needs_no_trackers_and_recordings_no_simulator() -> None:
         ("metaworld", ["cv2", "torch", "open3d", "flowlab.recordings"]),
         ("real", ["mujoco", "torch", "open3d"]),
     ):
-        code = "import sys; from flowlab.pipeline import worker, extraction; from flowlab.pipeline.recipe import load_recipe\n"
+        code = "import sys; from flowlab.pipeline import worker, filling\n"
+        code += "from flowlab.pipeline.recipe import load_recipe\n"
         code += f"load_recipe({recipe!r}).pipeline(); print([m for m in {foreign!r} if m in sys.modules])"
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert result.stdout.strip() == "[]"

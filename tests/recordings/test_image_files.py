@@ -19,7 +19,7 @@ from flowlab.recordings.image_files import (
     decode_depth,
     depth_stream,
     list_images,
-    natural_order,
+    natural_key,
 )
 
 RGB, DEPTH = colors(1)[0], counts(1)[0]
@@ -107,7 +107,7 @@ def test_names_sort_as_people_count(tmp_path: Path) -> None:
     for name in (*reversed(names), ".f0.png", "f3.txt"):
         (tmp_path / name).touch()
     assert [f.name for f in list_images(tmp_path, (".png",))] == names
-    assert sorted(["b", "10", "9", "a2", "a"], key=natural_order) == ["9", "10", "a", "a2", "b"]
+    assert sorted(["b", "10", "9", "a2", "a"], key=natural_key) == ["9", "10", "a", "a2", "b"]
 
 
 def test_looking_at_a_frame_takes_little() -> None:

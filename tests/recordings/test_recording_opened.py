@@ -26,7 +26,7 @@ from real_recordings import (
 
 from flowlab.errors import DataError, UsageError
 from flowlab.geometry.camera import Camera
-from flowlab.recordings.imaging import shrink_intrinsics
+from flowlab.recordings.frame_processing import shrink_intrinsics
 from flowlab.recordings.recording import RecordingSettings, describe, find_recordings
 
 
@@ -373,7 +373,7 @@ def test_large_pictures_are_shrunk_by_a_whole_factor(folder: Path, max_width: in
 
 
 def test_opening_keeps_no_picture(folder: Path) -> None:
-    """Rows are decoded when they are asked for: what a file holds then is what comes."""
+    """AlignedSamples are decoded when they are asked for: what a file holds then is what comes."""
     recording = opened(folder)
     write_png(folder / "depth/0001.png", counts()[4])
     np.testing.assert_array_equal(recording.frame(1).depth, counts()[4] * np.float32(0.001))

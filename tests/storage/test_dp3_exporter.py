@@ -13,7 +13,7 @@ from synthetic import make_dataset, make_episode
 
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 TYPES = {"data/state": "<f4", "data/action": "<f4", "data/point_cloud": "<f4", "meta/episode_ends": "<i8"}
 
@@ -71,7 +71,7 @@ def test_one_task_is_exported(small_dataset: Path, tmp_path: Path, flowlab: Cli)
 def test_episodes_find_their_place_however_they_lie_in_shards(tmp_path: Path) -> None:
     made = [make_episode(k, task=task, steps=40 + 33 * k) for task in ("push", "roll") for k in range(4)]
     units = [[made[6], made[4]], [made[0], made[1]], [made[7]], [made[5]], [made[2], made[3]]]
-    assert export_dp3(make_dataset(tmp_path / "d", units), tmp_path / "s") == 8
+    assert DP3Exporter().export(make_dataset(tmp_path / "d", units), tmp_path / "s") == 8
     check_store(tmp_path / "s", made)
 
 
@@ -127,7 +127,7 @@ numpy.savez(sys.argv[2], **meta, **data)
 @pytest.mark.slow
 def test_the_zarr_of_dp3_reads_the_store(tmp_path: Path) -> None:
     made = [make_episode(k, steps=60 + k) for k in range(4)]
-    export_dp3(make_dataset(tmp_path / "d", [made]), tmp_path / "store.zarr")
+    DP3Exporter().export(make_dataset(tmp_path / "d", [made]), tmp_path / "store.zarr")
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
     python = tmp_path / "venv/bin/python"
     install = [python, "-m", "pip", "install", "--quiet", "zarr==2.18.3", "numcodecs<0.14", "numpy<2"]

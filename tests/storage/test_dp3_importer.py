@@ -17,7 +17,7 @@ from synthetic import assert_same, make_dataset, make_episode, make_filmed_episo
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.storage import stats
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 from flowlab.storage.importers.dp3 import DP3Store, count_points
 
 Arrays = dict[str, np.ndarray]
@@ -64,7 +64,7 @@ def write_v2(store: Path, arrays: Arrays) -> Path:
 
 def test_an_export_of_flowlab_is_read_back(tmp_path: Path) -> None:
     made = [make_episode(k, task=task, steps=40 + 33 * k) for task in ("push", "roll") for k in range(3)]
-    export_dp3(make_dataset(tmp_path / "d", [made[:3], made[3:]]), tmp_path / "all.zarr")
+    DP3Exporter().export(make_dataset(tmp_path / "d", [made[:3], made[3:]]), tmp_path / "all.zarr")
     assert DP3Store.looks_like(tmp_path / "all.zarr")
     store = DP3Store(tmp_path / "all.zarr")
     assert (store.path, store.task, len(store)) == (tmp_path / "all.zarr", "all", 6)
@@ -266,6 +266,6 @@ def test_states_that_are_all_zero_are_no_damage(tmp_path: Path) -> None:
     """Today's zarr leaves chunks of zeros out."""
     episode = make_filmed_episode()
     assert not episode.state.any()
-    export_dp3(make_dataset(tmp_path / "d", [[episode, replace(episode, seed=4)]]), tmp_path / "s")
+    DP3Exporter().export(make_dataset(tmp_path / "d", [[episode, replace(episode, seed=4)]]), tmp_path / "s")
     assert not (tmp_path / "s/data/state/0.0").exists()
     assert [e.state.tolist() for e in DP3Store(tmp_path / "s").episodes()] == [np.zeros((12, 7)).tolist()] * 2

@@ -241,7 +241,7 @@ def test_writing_onto_a_shard_replaces_it(path: Path, episodes: list[Episode]) -
 
 
 MIXED = {
-    "cameras": lambda e: replace(e, camera=replace(e.camera, K=2 * e.camera.K)),
+    "cameras": lambda e: replace(e, camera=replace(e.camera, K=e.camera.K * [[2], [2], [1]])),
     "things": lambda e: replace(e, queries=replace(e.queries, entities=(Entity("x", "x", Role.ROBOT),) * 2)),
     "arrays": lambda e: replace(e, object_pose=None),
     "kinds of tracks": with_quality,
@@ -293,7 +293,7 @@ def test_the_digest_changes_with_everything_that_is_stored() -> None:
         replace(plain, task="other"),
         replace(plain, seed=1),
         replace(plain, extras={"rand_vec": [0.0]}),
-        replace(plain, camera=replace(plain.camera, width=17)),
+        replace(plain, camera=replace(plain.camera, K=plain.camera.K * [[2], [2], [1]])),
     ]
     digests = [episode_digest(e) for e in [plain, *changed]]
     assert len(set(digests)) == len(digests)

@@ -31,10 +31,10 @@ def plane_depth(offset: float = OFFSET) -> np.ndarray:
     return (offset / (NORMAL @ RAY)).reshape(HEIGHT, WIDTH)
 
 
-def tracks_of(xy: np.ndarray, visible: np.ndarray | bool = True, depth: np.ndarray | None = None) -> Tracks2D:
+def tracks_of(xy: np.ndarray, visible: np.ndarray | bool = True, xyz_cam: np.ndarray | None = None) -> Tracks2D:
     shape = xy.shape[:2]
     seen = np.broadcast_to(visible, shape).copy()
-    return Tracks2D(xy.astype(np.float32), seen, seen.astype(np.float32), depth=depth)
+    return Tracks2D(xy.astype(np.float32), seen, seen.astype(np.float32), xyz_cam=xyz_cam)
 
 
 def lifted(clip: Clip, tracks: Tracks2D, **options: float) -> Lifted:
@@ -177,7 +177,8 @@ def test_a_model_places_points_in_and_out_of_sight() -> None:
     depth = np.full((10, HEIGHT, WIDTH), 1.0)
     depth[:, :, :40] = 0.7
     xy = np.broadcast_to(np.array([[60.0, 20], [10, 20], [60, 40]]), (10, 3, 2))
-    model = np.full((10, 3), 1.005, np.float32)
+    model = np.full((10, 3, 3), 1.005, np.float32)
+    model[..., :2] = np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3, 2))  # off the rays of the pixels
     model[4:, 2] = 0  # it knows nothing of the third point from here on
     seen = np.ones((10, 3), bool)
     seen[3:, 0] = False
@@ -185,7 +186,7 @@ def test_a_model_places_points_in_and_out_of_sight() -> None:
     assert (out.source[0] == PositionSource.MEASURED).all()
     np.testing.assert_allclose(z_of(out)[0], [1.0, 0.7, 1.0], atol=1e-6)  # their own readings
     assert (out.source[1:, :2] == PositionSource.MODEL).all()
-    np.testing.assert_allclose(z_of(out)[1:, :2], 1.005, atol=1e-6)
+    np.testing.assert_allclose(out.xyz_world[1:, :2], apply(T_WORLD_CAM, model[1:, :2].astype(float)), atol=1e-6)
     assert (out.depth_valid[1:, 0]).all()
     assert not out.depth_valid[1:, 1].any()  # the sensor sees something 30 cm before it
     assert (out.visible[:, :2] == seen[:, :2]).all()

@@ -3,17 +3,19 @@
 import pytest
 
 from flowlab.errors import UsageError
-from flowlab.tracking.base import known_trackers, make_tracker
+from flowlab.registry import TRACKERS
+from flowlab.tracking.base import make_tracker
 from flowlab.tracking.trackers.lucas_kanade import LucasKanade
 
 
 def test_trackers_are_found_by_name_and_take_options() -> None:
     assert make_tracker("lucas-kanade") == LucasKanade()
+    assert make_tracker("flowlab.tracking.trackers.lucas_kanade:LucasKanade") == LucasKanade()
     assert make_tracker("lucas-kanade", {"window": 15, "levels": "2"}) == LucasKanade(window=15, levels=2)
 
 
 def test_every_installed_tracker_is_listed_with_where_it_lives() -> None:
-    assert known_trackers()["lucas-kanade"] == "flowlab.tracking.trackers.lucas_kanade:LucasKanade"
+    assert TRACKERS.plugins()["lucas-kanade"].place == "flowlab.tracking.trackers.lucas_kanade:LucasKanade"
 
 
 def test_a_tracker_says_what_made_its_labels() -> None:

@@ -91,6 +91,16 @@ def lost_as_nan(tracks: Tracks2D, queries: np.ndarray, start: int) -> Tracks2D:
     return replace(tracks, xy=np.where(outside[..., None], np.float32(np.nan), tracks.xy))
 
 
+def behind(tracks: Tracks2D) -> np.ndarray:
+    """Positions with z backward, as OpenGL has it."""
+    return -in_pixels(tracks)
+
+
+def in_pixels(tracks: Tracks2D) -> np.ndarray:
+    """Pixels with depth, which are no positions."""
+    return np.concatenate([tracks.xy, np.ones_like(tracks.xy[..., :1])], -1)
+
+
 def late(session: Session, queries: np.ndarray, start: int, stop: int) -> Tracks2D:
     """Rows as if every clip began at frame 0."""
     return session.track(queries - np.float32([start, 0, 0]), 0, stop - start)
@@ -140,7 +150,10 @@ def pulls_inside(session: Session, queries: np.ndarray, start: int, stop: int) -
         ),
         (alter(lambda k, q, s: unchecked(k, xy=k.xy.swapaxes(0, 1))), r"xy must have shape \(10, \d+, 2\), but has"),
         (alter(lambda k, q, s: replace(k, confidence=k.confidence * 2)), "confidence must lie between 0 and 1"),
-        (alter(lambda k, q, s: unchecked(k, depth=k.confidence[:1])), "depth must have shape"),
+        (alter(lambda k, q, s: unchecked(k, residual=k.confidence[:1])), "residual must have shape"),
+        (alter(lambda k, q, s: unchecked(k, xyz_cam=k.xy)), r"xyz_cam must have shape \(10, \d+, 3\), but has"),
+        (alter(lambda k, q, s: replace(k, xyz_cam=behind(k))), "xyz_cam must lie before the camera"),
+        (alter(lambda k, q, s: replace(k, xyz_cam=in_pixels(k))), "xyz_cam must project to xy, but is .* px away"),
         (alter(lambda k, q, s: (k.xy, k.visible)), "track.. must return a Tracks2D, but returns a tuple"),
         (alter(lambda k, q, s: replace(k, visible=k.visible & False)), "must be visible at the frame of its query"),
         (alter(seen_before_query), "before the frame of its query a point must not be visible"),

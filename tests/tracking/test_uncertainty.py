@@ -26,7 +26,7 @@ def case(
     xy = np.tile(np.array([[20, 30], [50, 60], [90, 40], [120, 100]], np.float32), (T, 1, 1))
     tracks = Tracks2D(
         xy, np.ones((T, M), bool), np.ones((T, M), np.float32), *np.zeros((2, T, M), np.float32),
-        depth=np.full((T, M), z, np.float32), residual=np.full((T, M), 0.2, np.float32),
+        residual=np.full((T, M), 0.2, np.float32),
     )  # fmt: skip
     xyz_world = camera.unproject(xy, np.full((T, M), z)).astype(np.float32)
     seen = np.ones((T, M), bool)

@@ -17,7 +17,7 @@ from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, FlowPrediction, Queries, Role, Tracks3D
 from flowlab.viz.colors import PREDICTED_RGB, ROLE_RGB, cloud_rgb
-from flowlab.viz.flow_prediction import compose_flow_prediction, draw_flow_prediction
+from flowlab.viz.flow_prediction import draw_flow_prediction, plot_flow_prediction
 from flowlab.viz.panels import TIME_COLORS
 from flowlab.viz.recording import write_rrd
 from flowlab.viz.video import write_video
@@ -252,7 +252,7 @@ def test_stills_show_expected_and_true_paths(episode: Episode, prediction: FlowP
     draw_flow_prediction(episode, prediction, tmp_path / "e.png", title="slide", plan=0)
     image, figure = (
         np.round(imread(tmp_path / "e.png")[..., :3] * 255),
-        compose_flow_prediction(episode, prediction, "", 0),
+        plot_flow_prediction(episode, prediction, "", 0),
     )
     assert image.shape == (960, 1800, 3)
     expected, true = prediction.paths_world[0, :, 1], episode.tracks.xyz_world[:7, 1]
@@ -279,31 +279,31 @@ def test_captions_state_the_error_while_the_plan_was_executed(episode: Episode, 
         1: ["plan of step 6, 6 of its 8 steps", "no point moves", "0 of 0 predicted"],
         2: ["plan of step 12, 7 of its 8 steps", "over 2 moving", "1 of 1 predicted"],
     }.items():
-        text = words(compose_flow_prediction(episode, prediction, "a title", plan))
+        text = words(plot_flow_prediction(episode, prediction, "a title", plan))
         for fact in ["a title", "slide, seed 7", *facts]:
             assert fact in text
 
 
 def test_by_default_the_plan_that_moves_the_objects_most_is_shown(episode: Episode, prediction: FlowPrediction) -> None:
-    assert "plan of step 12" in words(compose_flow_prediction(episode, prediction, ""))
+    assert "plan of step 12" in words(plot_flow_prediction(episode, prediction, ""))
     quick = prediction.paths_world.copy()
     quick[0, :, 0] += TIMES[:, None] * [0.2, 0, 0]  # the robot's
     robot = replace(prediction, paths_world=quick)
-    assert "plan of step 12" in words(compose_flow_prediction(episode, robot, ""))
+    assert "plan of step 12" in words(plot_flow_prediction(episode, robot, ""))
     unknown = replace(episode, queries=replace(episode.queries, owner=np.full(6, -1, np.int16)))
-    assert "plan of step 0" in words(compose_flow_prediction(unknown, robot, ""))
+    assert "plan of step 0" in words(plot_flow_prediction(unknown, robot, ""))
 
 
 def test_the_cloud_of_the_plans_step_is_drawn(episode: Episode, prediction: FlowPrediction) -> None:
     cloud = episode.point_cloud.copy()
     cloud[12, :, 0] += 0.01
-    there = compose_flow_prediction(replace(episode, point_cloud=cloud), prediction, "").axes[1]
+    there = plot_flow_prediction(replace(episode, point_cloud=cloud), prediction, "").axes[1]
     drawn = next(np.asarray(c.get_offsets()) for c in there.collections if len(c.get_offsets()) == 50)
     np.testing.assert_allclose(np.sort(drawn, 0), np.sort(cloud[12][:, [0, 2]], 0), atol=1e-6)
 
 
 def test_the_close_up_shows_the_objects(episode: Episode, prediction: FlowPrediction) -> None:
-    left, right = compose_flow_prediction(episode, prediction, "", 0).axes[:2]
+    left, right = plot_flow_prediction(episode, prediction, "", 0).axes[:2]
     spans = defaultdict(list)
     for axes, points in ((left, [0, 1]), (right, [1])):
         paths = prediction.paths_world[0][:, points]
@@ -319,7 +319,7 @@ def test_the_close_up_shows_the_objects(episode: Episode, prediction: FlowPredic
 @pytest.mark.parametrize("plan", [3, -1])
 def test_a_plan_that_is_not_there_is_one_sentence(plan: int, episode: Episode, prediction: FlowPrediction) -> None:
     with pytest.raises(DataError, match=f"slide, seed 7: no plan {plan}; there are 3, counted from 0") as error:
-        compose_flow_prediction(episode, prediction, "", plan)
+        plot_flow_prediction(episode, prediction, "", plan)
     assert "\n" not in str(error.value)
 
 

@@ -9,8 +9,8 @@ from matplotlib.image import imread
 
 from flowlab.geometry.camera import Camera
 from flowlab.grading.ground_truth import GroundTruth
-from flowlab.grading.metrics import CURVE_MM, Estimate, TrackMetrics, measure
-from flowlab.viz.grade_figure import GROUPS, RELIABILITY_POINTS, compose, draw_grades
+from flowlab.grading.metrics import CURVE_MM, EstimatedTracks, TrackMetrics, measure
+from flowlab.viz.grade_figure import GROUPS, RELIABILITY_POINTS, draw_grades, plot_grades
 
 CAMERA = Camera(320, 240, np.diag([250.0, 250.0, 1.0]), np.eye(4))
 
@@ -24,12 +24,14 @@ def make_metrics(error_m: float, *, roles: bool = True, sigma: bool = True) -> T
     truth = GroundTruth(np.zeros((30, 2), np.float32), tracks, visible, np.full(30, 2, np.int8) if roles else None)
     error = rng.uniform(0, 2 * error_m, (20, 30))
     stated = (error * 1.1).astype(np.float32) if sigma else None
-    return measure(Estimate((tracks + error[..., None] * [0, 0, 1]).astype(np.float32), visible, stated), truth, CAMERA)
+    return measure(
+        EstimatedTracks((tracks + error[..., None] * [0, 0, 1]).astype(np.float32), visible, stated), truth, CAMERA
+    )
 
 
 def test_a_panel_for_each_group_and_a_line_for_each_tracker() -> None:
     metrics = {"good": make_metrics(0.002), "poor": make_metrics(0.02, sigma=False)}
-    figure = compose(metrics, "two trackers", "made by hand")
+    figure = plot_grades(metrics, "two trackers", "made by hand")
     *panels, reliability = figure.axes
     assert [p.get_title(loc="left") for p in panels] == list(GROUPS.values())
     for panel, group in zip(panels, GROUPS, strict=True):
@@ -49,10 +51,10 @@ def test_a_panel_for_each_group_and_a_line_for_each_tracker() -> None:
 
 
 def test_absent_groups_have_no_panel() -> None:
-    figure = compose({"only": make_metrics(0.01, roles=False, sigma=False)}, "camera moves")
+    figure = plot_grades({"only": make_metrics(0.01, roles=False, sigma=False)}, "camera moves")
     assert [a.get_title(loc="left") for a in figure.axes] == [GROUPS["all"]]
     nothing = replace(make_metrics(0.01, roles=False, sigma=False), all=None)
-    assert len(compose({"nothing": nothing}, "a single frame").axes) == 1
+    assert len(plot_grades({"nothing": nothing}, "a single frame").axes) == 1
 
 
 def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

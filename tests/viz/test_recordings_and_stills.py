@@ -25,12 +25,12 @@ from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
 from flowlab.storage.dataset import begin, keep_receipt
 from flowlab.storage.manifest import Reject
 from flowlab.storage.shard import write_shard
-from flowlab.viz.blueprint import layout
+from flowlab.viz.blueprint import make_blueprint
 from flowlab.viz.captions import caption, describe, moving
 from flowlab.viz.colors import ROLE_RGB, UNKNOWN, cloud_rgb_at, sigma_rgb
+from flowlab.viz.orientation import up_from_world
 from flowlab.viz.recording import TRAIL_STEPS, write_rrd
-from flowlab.viz.still import TIME_COLORS, compose, draw_still
-from flowlab.viz.upright import up_from_world
+from flowlab.viz.still import TIME_COLORS, draw_still, plot_still
 
 T, P, M, DISTINCT_POINTS, DISTINCT_QUERIES = 30, 50, 8, 40, 6
 FAR = 99.0
@@ -231,7 +231,7 @@ def picture(episode: Episode, path: Path) -> np.ndarray:
 
 def colors_at(image: np.ndarray, episode: Episode, panel: int, place: np.ndarray) -> np.ndarray:
     """The 5 x 5 pixels of the image around a place in the coordinates of a panel."""
-    figure = compose(episode, "slide")
+    figure = plot_still(episode, "slide")
     x, y = figure.axes[panel].transData.transform(place)
     row, column = round(len(image) - y), round(x)
     return image[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3)
@@ -378,10 +378,10 @@ def test_a_lost_point_does_not_shrink_the_scene() -> None:
     xyz_world[200:202, 2] = 500
     lost = replace(long, tracks=replace(long.tracks, xyz_world=xyz_world))
     for e in (long, lost):
-        spans = [np.ptp(compose(e, "").axes[k].get_xlim()) for k in (0, 1)]
+        spans = [np.ptp(plot_still(e, "").axes[k].get_xlim()) for k in (0, 1)]
         assert spans[0] < 2000
         assert spans[1] < 10
-        eye = layout(e).root_container.contents[0].properties["EyeControls3D"]  # type: ignore[union-attr]
+        eye = make_blueprint(e).root_container.contents[0].properties["EyeControls3D"]  # type: ignore[union-attr]
         assert np.abs(eye.position.as_arrow_array().to_pylist()).max() < 10
 
 
@@ -399,7 +399,7 @@ def test_clouds_of_recordings_have_the_colors_of_the_picture(real: Episode, epis
 
 
 def test_stills_of_recordings_are_upright(real: Episode) -> None:
-    figure = compose(real, "pour")
+    figure = plot_still(real, "pour")
     camera, side = figure.axes[:2]
     assert (side.get_xlabel(), side.get_ylabel()) == ("z [m]", "−y [m]")
     points = np.concatenate(
@@ -409,7 +409,7 @@ def test_stills_of_recordings_are_upright(real: Episode) -> None:
     assert side.get_ylim()[1] > side.get_ylim()[0]
     assert camera.get_ylim()[1] < camera.get_ylim()[0]
     placed = make_filmed_episode(LOOKING_ALONG_Y)
-    assert compose(placed, "pour").axes[1].get_ylabel() == "z [m]"
+    assert plot_still(placed, "pour").axes[1].get_ylabel() == "z [m]"
 
 
 def test_stills_of_recordings_show_the_error(real: Episode, tmp_path: Path) -> None:
@@ -418,12 +418,12 @@ def test_stills_of_recordings_show_the_error(real: Episode, tmp_path: Path) -> N
         expected = 0.8 * sigma_rgb(np.array([0.02]))[0]
         uv, _ = real.camera.project(real.tracks.xyz_world[0, k])
         assert np.abs(colors_at(image, real, 0, uv) - expected).max(-1).min() < 12
-    texts = [text.get_text() for text in compose(real, "pour").legends[0].get_texts()]
+    texts = [text.get_text() for text in plot_still(real, "pour").legends[0].get_texts()]
     assert texts == ["σ = 0 mm", "σ = 20 mm", "≥ 40 mm", "start", "end"]
 
 
 def test_a_note_stands_in_the_still(real: Episode) -> None:
-    texts = [text.get_text() for text in compose(real, "pour", note="too poor " * 60).texts]
+    texts = [text.get_text() for text in plot_still(real, "pour", note="too poor " * 60).texts]
     (note,) = [text for text in texts if text.startswith("too poor")]
     assert note.endswith("…")
     assert len(note) <= 170

@@ -2,17 +2,19 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
+from jaxtyping import Float32
 from pydantic import Field, model_validator
 
 from flowlab.errors import DataError
+from flowlab.geometry.camera import Camera
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.shared import ObserverStage, QueriesStage, WriteStage, labeled
 from flowlab.provenance import Provenance
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
-from flowlab.records import Clip, Episode, QueriedDemo, TrackedDemo
+from flowlab.records import Clip, Episode, QueriedDemo, Queries, TrackedDemo
 from flowlab.tracking.base import make_tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
 from flowlab.tracking.labeling import to_3d
@@ -37,7 +39,7 @@ WORLD_FRAME = (
 class RecordingStage(Stage, RecordingSettings):
     """A recording is opened, its streams put on one time axis."""
 
-    stage: Literal["recording"] = "recording"
+    stage: str = "recording"
 
     def process(self, record: EpisodeRequest) -> Recording:
         """Open the recording that the request names."""
@@ -54,7 +56,7 @@ class RecordingStage(Stage, RecordingSettings):
 class TrackStage(Stage):
     """The query points are followed through the pictures."""
 
-    stage: Literal["track"] = "track"
+    stage: str = "track"
     tracker: str = "rigid-bodies"
     """Name of an installed tracker."""
     options: Mapping[str, Any] = {}
@@ -71,14 +73,20 @@ class TrackStage(Stage):
         """Follow the points from their pixels in the first frame."""
         clip = clip_of(record)
         tracker = make_tracker(self.tracker, self.options)
-        pixel, _ = clip.camera.project(record.queries.xyz_world.astype(np.float64))
-        # The points came from pixels, and rounding finds these again exactly.
-        tracks = follow(clip, np.rint(pixel).astype(np.float32), tracker, self.chunks)
+        tracks = follow(clip, _first_pixels(record.queries, clip.camera), tracker, self.chunks)
         return TrackedDemo(record, tracks, tracker.describe())
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:
         """The tracks are estimated."""
         return provenance.model_copy(update={"tracks": "estimated", "tracker": self.tracker})
+
+
+def _first_pixels(queries: Queries, camera: Camera) -> Float32[np.ndarray, "M 2"]:
+    """Where the queries are in the first picture (x, y): in the pixels they come from, as far as that is known."""
+    if queries.pixel is None:
+        return camera.project(queries.xyz_world.astype(np.float64))[0].astype(np.float32)
+    v, u = np.divmod(queries.pixel, camera.width)
+    return np.stack([u, v], -1).astype(np.float32)
 
 
 def clip_of(record: QueriedDemo) -> Clip:
@@ -92,7 +100,7 @@ def clip_of(record: QueriedDemo) -> Clip:
 class LiftStage(Stage, LiftSettings):
     """Tracks in the picture become tracks in the world, with what is known of their error."""
 
-    stage: Literal["lift"] = "lift"
+    stage: str = "lift"
 
     def process(self, record: TrackedDemo) -> Episode:
         """Lift the tracks by every frame's depth."""
@@ -104,7 +112,7 @@ class LiftStage(Stage, LiftSettings):
 class QualityStage(Stage):
     """Keeps out episodes whose tracks are too poor to learn from; they can still be looked at."""
 
-    stage: Literal["quality"] = "quality"
+    stage: str = "quality"
     sure_m: float = Field(default=0.05, gt=0)
     """A position counts as sure if the camera sees the point and its stated error is below this [m]."""
     min_sure_share: float = Field(default=0.25, ge=0, le=1)

@@ -4,7 +4,7 @@ work."""
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -32,7 +32,7 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
         state=demo.state,
         action=demo.action,
         success=demo.success,
-        queries=record.queries,
+        queries=replace(record.queries, pixel=None),
         tracks=tracks,
         object_pose=demo.object_pose,
         depth=seen.depth,
@@ -44,7 +44,7 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
 class ObserverStage(Stage, ObserverSettings):
     """The Observer looks at every frame."""
 
-    stage: Literal["observer"] = "observer"
+    stage: str = "observer"
 
     def process(self, record: Demonstration) -> ObservedDemo:
         """Unproject, crop and sample every frame."""
@@ -84,7 +84,7 @@ def _frame(demo: Demonstration, t: int) -> Frame:
 class QueriesStage(Stage, QuerySettings):
     """Query points are chosen on the first cloud."""
 
-    stage: Literal["queries"] = "queries"
+    stage: str = "queries"
 
     def process(self, record: ObservedDemo) -> QueriedDemo:
         """Choose the points to follow."""
@@ -106,7 +106,7 @@ def _settings(stage: Stage, group: type[Settings]) -> dict[str, Any]:
 class AcceptStage(Stage):
     """Keeps failed demonstrations out."""
 
-    stage: Literal["accept"] = "accept"
+    stage: str = "accept"
     success_steps: int = Field(default=5, ge=0)
     """Steps the task must have been solved for; 5 is DP3's rule."""
 
@@ -121,7 +121,7 @@ class AcceptStage(Stage):
 class WriteStage(Writer):
     """Writes the episodes of a unit into its shard."""
 
-    stage: Literal["write"] = "write"
+    stage: str = "write"
     depth: bool = False
     """Store the depth pictures too, so that clouds can be cropped anew later."""
     rgb: bool = True

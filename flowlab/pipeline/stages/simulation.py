@@ -1,7 +1,5 @@
 """The stages of simulation, with those it shares. Each is a thin skin over the function that does the work."""
 
-from typing import Literal
-
 from flowlab.errors import DataError
 from flowlab.pipeline.memory import return_freed_memory
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
@@ -18,7 +16,7 @@ __all__ = ["AcceptStage", "ExpertStage", "ObserverStage", "QueriesStage", "Rigid
 class ExpertStage(Stage, ExpertSettings):
     """MetaWorld's scripted expert tries the task."""
 
-    stage: Literal["expert"] = "expert"
+    stage: str = "expert"
     scene: SceneSettings = SceneSettings()
     """What the camera is shown."""
 
@@ -51,7 +49,7 @@ _last_simulator: dict[tuple[str, SceneSettings], TaskSimulator] = {}
 class RigidFlowStage(Stage, RigidFlowSettings):
     """Exact tracks: simulated bodies carry their surface points along."""
 
-    stage: Literal["rigid-flow"] = "rigid-flow"
+    stage: str = "rigid-flow"
     of = Rollout
 
     def process(self, record: QueriedDemo) -> Episode:

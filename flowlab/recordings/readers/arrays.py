@@ -55,8 +55,8 @@ class ArraysReader:
     """Reads arrays with a row per step."""
 
     name = "arrays"
-    looks_for = "an .npz file or a folder of .npy files with color and depth (img and depth, say)"
-    general = False
+    expects = "an .npz file or a folder of .npy files with color and depth (img and depth, say)"
+    fallback = False
 
     def probe(self, path: Path) -> bool:
         """Whether arrays of pictures, or of clouds, are there by name."""

@@ -21,8 +21,8 @@ class PlainReader:
     """Reads folders of color and depth pictures."""
 
     name = "plain"
-    looks_for = f"a folder with color/, depth/ and {FILE_NAME}"
-    general = True
+    expects = f"a folder with color/, depth/ and {FILE_NAME}"
+    fallback = True
 
     def probe(self, path: Path) -> bool:
         """Whether it has the two folders, which ``recording.yaml`` may call otherwise."""

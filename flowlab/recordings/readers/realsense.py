@@ -3,10 +3,10 @@
 import hashlib
 import json
 import os
-import shutil
 from pathlib import Path
 
 from flowlab.errors import DataError, MissingLibraryError
+from flowlab.files import new_folder
 from flowlab.recordings.base import Streams
 from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.readers.plain import open3d_calibration, read_folder
@@ -19,8 +19,8 @@ class RealSenseReader:
     """Reads what realsense-viewer and the SDK record."""
 
     name = "realsense"
-    looks_for = "a .bag file of the RealSense SDK"
-    general = False
+    expects = "a .bag file of the RealSense SDK"
+    fallback = False
 
     def probe(self, path: Path) -> bool:
         """Whether it is a bag whose topics are the SDK's."""
@@ -75,19 +75,12 @@ def extracted(path: Path) -> Path:
     folder = cache() / f"{path.stem}-{key}"
     if folder.is_dir():
         return folder
-    temporary = folder.with_name(f".tmp-{os.getpid()}+{folder.name}")
     try:
-        temporary.mkdir(parents=True, exist_ok=True)
-        _extract(path, temporary)
-        try:
-            os.rename(temporary, folder)
-        except OSError:
-            if not folder.is_dir():  # another process was faster, with the same content
-                raise
+        with new_folder(folder) as temporary:
+            _extract(path, temporary)
     except OSError as error:
-        raise DataError(f"{path}: cannot be extracted to {folder} ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if not folder.is_dir():  # else another process was faster, with the same content
+            raise DataError(f"{path}: cannot be extracted to {folder} ({error.strerror or error})") from error
     return folder
 
 

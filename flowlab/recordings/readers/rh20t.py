@@ -17,7 +17,7 @@ from flowlab.geometry.transforms import inverse
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import COLOR_SUFFIXES, color_stream, depth_stream, list_images
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
-from flowlab.recordings.readers.pickled import load_object
+from flowlab.recordings.readers.safe_pickle import load_pickled_mapping
 
 STATE = ("tcp", "gripper_command")
 """Folders of robot state, in the order of its columns."""
@@ -27,8 +27,8 @@ class RH20TReader:
     """Reads one camera of an episode."""
 
     name = "rh20t"
-    looks_for = "an episode folder with cam_<serial>/color and cam_<serial>/depth"
-    general = False
+    expects = "an episode folder with cam_<serial>/color and cam_<serial>/depth"
+    fallback = False
 
     def probe(self, path: Path) -> bool:
         """Whether it is an episode, or the folder of a camera in one."""
@@ -65,6 +65,8 @@ def _cameras(episode: Path) -> list[Path]:
 
 def _choose(episode: Path, serial: str | None) -> Path:
     cameras = _cameras(episode)
+    if not cameras:
+        raise DataError(f"{episode}: has no folder cam_<serial> with color/ and depth/ in it")
     serials = [c.name.removeprefix("cam_") for c in cameras]
     if serial is None and len(cameras) == 1:
         return cameras[0]
@@ -134,10 +136,10 @@ def _calibration(
     if folder is None:
         return (), (f"its calibration calib/{name} is not beside it",)
     values: dict[str, Any] = {}
-    K = load_object(folder / "intrinsics.npy").get(serial)
+    K = load_pickled_mapping(folder / "intrinsics.npy").get(serial)
     if K is not None:
         values["intrinsics"] = Intrinsics.from_matrix(np.asarray(K))
-    T_cam_marker = load_object(folder / "extrinsics.npy").get(serial)
+    T_cam_marker = load_pickled_mapping(folder / "extrinsics.npy").get(serial)
     if T_cam_marker is not None:
         T = inverse(np.asarray(T_cam_marker, float).reshape(4, 4))
         T[3] = 0, 0, 0, 1

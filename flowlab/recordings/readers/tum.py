@@ -30,8 +30,8 @@ class TUMReader:
     """Reads sequences of the benchmark, and what is recorded in its layout."""
 
     name = "tum"
-    looks_for = "a folder with rgb.txt and depth.txt, or associations.txt"
-    general = False
+    expects = "a folder with rgb.txt and depth.txt, or associations.txt"
+    fallback = False
 
     def probe(self, path: Path) -> bool:
         """Whether it has the lists."""

@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 from jaxtyping import Float32, Int32
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, first_line
 from flowlab.geometry.camera import Camera
 from flowlab.records import Episode, Queries, Tracks3D
 
@@ -111,7 +111,7 @@ class DP3Store:
         try:
             return np.asarray(self._arrays[name][start:stop])
         except (ValueError, RuntimeError, OSError) as error:
-            raise DataError(f"{self.path}/{name}: damaged ({_first_line(error)}); {_REDO}") from error
+            raise DataError(f"{self.path}/{name}: damaged ({first_line(error)}); {_REDO}") from error
 
     def _open_group(self) -> zarr.Group:
         try:
@@ -119,7 +119,7 @@ class DP3Store:
         except FileNotFoundError as error:
             raise DataError(f"{self.path}: there is no zarr v2 store here") from error
         except (ValueError, OSError) as error:
-            raise DataError(f"{self.path}: not a readable zarr v2 store ({_first_line(error)}); {_REDO}") from error
+            raise DataError(f"{self.path}: not a readable zarr v2 store ({first_line(error)}); {_REDO}") from error
 
     def _open(self, group: zarr.Group, name: str) -> "zarr.Array[Any]":
         """An array, its values unread."""
@@ -131,7 +131,7 @@ class DP3Store:
                 f"a store in DP3's layout has {', '.join((*_DATA, _ENDS))}"
             ) from error
         except (ValueError, TypeError, OSError) as error:
-            raise DataError(f"{self.path}/{name}: damaged ({_first_line(error)}); {_REDO}") from error
+            raise DataError(f"{self.path}/{name}: damaged ({first_line(error)}); {_REDO}") from error
         if not isinstance(array, zarr.Array):
             raise DataError(f"{self.path}/{name}: a group, expected an array")
         if array.dtype.kind not in "fiu":
@@ -186,7 +186,3 @@ def count_points(point_cloud: Float32[np.ndarray, "T N 3"]) -> Int32[np.ndarray,
     padding = (point_cloud == 0).all(-1)[:, ::-1]
     trailing = np.where(padding.all(1), padding.shape[1], padding.argmin(1))
     return np.maximum(padding.shape[1] - trailing, 1).astype(np.int32)
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().split("\n")[0] or type(error).__name__

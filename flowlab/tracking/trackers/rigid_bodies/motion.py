@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,22 +14,34 @@ class RigidMotion:
     t: Float64[np.ndarray, "T 3"]
 
     @classmethod
-    def still(cls, frames: int) -> "RigidMotion":
+    def identity(cls, frames: int) -> "RigidMotion":
         """No motion at all."""
         return cls(np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)))
 
-    def carry(self, xyz_cam: np.ndarray) -> Float64[np.ndarray, "T n 3"]:
-        """Where the motion takes points (n, 3) of frame 0."""
+    def apply(self, xyz_cam: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "T n 3"]:
+        """Where the motion takes points of frame 0 [m]."""
         return xyz_cam @ self.R.swapaxes(1, 2) + self.t[:, None]
 
 
-def best_rigid(
-    a: np.ndarray, b: np.ndarray, weight: np.ndarray, refinements: int, scale: float = 0.006
-) -> tuple[np.ndarray, np.ndarray]:
-    """The rigid motions that best take points a onto b, robustly (Kabsch 1976, reweighted by Geman-McClure).
+def fit_rigid(
+    a: Float[np.ndarray, "*#batch n 3"],
+    b: Float[np.ndarray, "*#batch n 3"],
+    weight: Float[np.ndarray, "*#batch n"],
+    refinements: int,
+    scale: float = 0.006,
+) -> tuple[Float64[np.ndarray, "*out 3 3"], Float64[np.ndarray, "*out 3"]]:
+    """The rigid motions that best take points onto others (Kabsch 1976, reweighted by Geman-McClure).
 
-    a (..., n, 3), b (..., n, 3), weight (..., n), ``scale`` [m] of a residual that still counts.
-    Returns R (..., 3, 3) and t (..., 3).
+    Args:
+        a: Points [m]; leading dimensions broadcast.
+        b: Where each of them should go [m].
+        weight: How much each counts; where all are 0, the motion is the identity.
+        refinements: How many times what does not fit is weighed down.
+        scale: A residual [m] that still counts.
+
+    Returns:
+        R and t, so that ``b`` is near ``R @ a + t``. R is a rotation, never a reflection, also where points on a
+        line or in a plane leave one open.
     """
     w = weight.astype(float)
     for k in range(refinements + 1):
@@ -47,7 +59,7 @@ def best_rigid(
     return R, t
 
 
-def orthonormal(R: np.ndarray) -> np.ndarray:
-    """The nearest rotations to matrices (..., 3, 3)."""
+def nearest_rotation(R: Float64[np.ndarray, "*batch 3 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    """The orthogonal matrices nearest to some that are nearly rotations."""
     U, _, Vt = np.linalg.svd(R)
     return U @ Vt

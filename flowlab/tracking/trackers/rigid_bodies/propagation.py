@@ -3,26 +3,25 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.ndimage import convolve
 
-from flowlab.tracking.trackers.rigid_bodies import _kernels
-from flowlab.tracking.trackers.rigid_bodies.fit import Fit
-from flowlab.tracking.trackers.rigid_bodies.labels import point_costs
-from flowlab.tracking.trackers.rigid_bodies.segments import STEP
+from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
+from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
+from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
 
-_OWN = 0.7
+_OWN_WEIGHT = 0.7
 """Weight of a point's own cost against one cell's that looks exactly like it."""
-
-_SETTLING, _SETTLING_PRIOR = 4, 3.0
+_REFINE_FRAMES, _REFINE_PRIOR = 4, 3.0
 """Frames to either side over which readings of the surface are averaged, and the weight of no shift among them."""
-_ALMOST = 0.06
+_COST_SCALE = 0.06
 """A cost this much higher explains a point almost as well."""
 
 
 @dataclass(frozen=True, slots=True)
 class PropagatedTracks:
-    """Queries carried by a fit."""
+    """Query points, carried by the motions of a fit."""
 
     xyz_cam: Float64[np.ndarray, "T M 3"]
     visible: Bool[np.ndarray, "T M"]
@@ -36,67 +35,73 @@ class PropagatedTracks:
     """How badly color and depth fit at that very frame, 0 to 1; where the point is hidden, its cost."""
 
 
-def propagate(fit: Fit, uv: np.ndarray, z: np.ndarray) -> PropagatedTracks:
-    """Carry points at pixels (M, 2) and depths (M,) [m] of the first frame through the clip."""
+def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarray, "M"]) -> PropagatedTracks:
+    """Carry points of the first frame through the clip.
+
+    Args:
+        fit: The motions, and which pixels are whose.
+        uv: The points' pixels in the pictures of the fit.
+        z: Their depths there [m].
+    """
     xyz = fit.pictures.unproject(uv.astype(float), z.astype(float))
-    cost = _surrounded(fit, uv, z, point_costs(fit.pictures, fit.motions, uv, xyz))
+    cost = _smooth_costs(fit, uv, z, motion_costs(fit.pictures, fit.motions, uv, xyz))
     motion = cost.argmin(0)
-    every = np.stack([m.carry(xyz) for m in fit.motions])
+    every = np.stack([m.apply(xyz) for m in fit.motions])
     path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
-    path = _settled(fit, path, motion > 0)
-    seen, least = _seen(fit, path), cost.min(0)
-    belief = np.exp(-(cost - least) / _ALMOST)
+    path = _refine_depth(fit, path, motion > 0)
+    seen, least = _visible(fit, path), cost.min(0)
+    belief = np.exp(-(cost - least) / _COST_SCALE)
     belief /= belief.sum(0)
     spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
     return PropagatedTracks(path, seen, motion, least, spread, _residual(fit, uv, path, seen, least))
 
 
-def _settled(fit: Fit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
+def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Paths (T, M, 3) of moving points shifted along their rays to the surface that is read there, smoothly in time.
 
     What is left of a pose's error changes slowly, while the sensor's changes from frame to frame; a still point is
     left alone, since it has no pose to err.
     """
     z = path[..., 2]
-    off = _kernels.above_surface(fit.pictures.depth, fit.pictures.project(path), z)
+    off = _surfaces.depth_offsets(fit.pictures.depth, fit.pictures.project(path), z)
     off[:, ~moving], off[0] = np.nan, 0
     known = np.isfinite(off).astype(float)
-    window = np.hanning(2 * _SETTLING + 3)[1:-1, None]
+    window = np.hanning(2 * _REFINE_FRAMES + 3)[1:-1, None]
     total, weight = (convolve(x, window, mode="constant") for x in (np.nan_to_num(off), known))
-    smooth = total / (weight + _SETTLING_PRIOR)
+    smooth = total / (weight + _REFINE_PRIOR)
     smooth[0] = 0
     return path * (1 + smooth / np.maximum(z, 0.05))[..., None]
 
 
-def _residual(fit: Fit, uv: np.ndarray, path: np.ndarray, seen: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    features = _kernels.features_at(fit.pictures.feature[0], uv.astype(np.float32))
+def _residual(fit: RigidBodyFit, uv: np.ndarray, path: np.ndarray, seen: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    features = _costs.features_at(fit.pictures.feature[0], uv.astype(np.float32))
     p = fit.pictures
-    now = _kernels.misfit(p.depth, p.feature, features, p.project(path), path[..., 2])
+    now = _costs.residuals(p.depth, p.feature, features, p.project(path), path[..., 2])
     return np.where(seen & (now >= 0), now, cost.clip(0, 1)).astype(np.float32)
 
 
-def _surrounded(fit: Fit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> np.ndarray:
+def _smooth_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> np.ndarray:
     """The points' own costs (B, M) averaged with those of the cells around that are as deep and colored alike."""
     grid, height, width = fit.grid, *fit.grid.valid.shape
-    features = _kernels.features_at(fit.pictures.feature[0], uv.astype(np.float32))[:, 1:]
+    features = _costs.features_at(fit.pictures.feature[0], uv.astype(np.float32))[:, 1:]
     cell_features = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
     i, j = np.rint(uv[:, 1] / STEP).astype(int), np.rint(uv[:, 0] / STEP).astype(int)
-    total, weights = _OWN * own, np.full(len(uv), _OWN)
-    scale = np.array([_kernels.L, _kernels.A, _kernels.B])
+    total, weights = _OWN_WEIGHT * own, np.full(len(uv), _OWN_WEIGHT)
+    scale = np.array([_costs.L, _costs.A, _costs.B])
     for y in range(-3, 4):
         for x in range(-3, 4):
             a, b = np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)
             far = np.abs(grid.depth[a, b] - z) / (0.01 * np.maximum(1, z))
             color = (np.abs(cell_features[a, b] - features) * scale).sum(1)
             w = grid.valid[a, b] * np.exp(-np.minimum(far, 20) - color / 0.35 - (x * x + y * y) / 8)
-            total = total + w * fit.labels.raw[:, a, b]
+            total = total + w * fit.assignment.raw[:, a, b]
             weights = weights + w
     return (total / weights).astype(np.float32)
 
 
-def _seen(fit: Fit, path: np.ndarray) -> np.ndarray:
+def _visible(fit: RigidBodyFit, path: np.ndarray) -> np.ndarray:
     """Whether the depth pictures show the points (T, M, 3) where they are."""
     uv = fit.pictures.project(path)
     height, width = fit.pictures.depth.shape[1:]
     inside = ((uv > -0.5) & (uv < [width - 0.5, height - 0.5])).all(-1) & (path[..., 2] > 0)
-    return inside & _kernels.shown(fit.pictures.depth, uv, path[..., 2])
+    return inside & _surfaces.is_seen(fit.pictures.depth, uv, path[..., 2])

@@ -1,10 +1,10 @@
-"""The ``bodies`` tracker: queries carried by the motions of a fit."""
+"""The ``rigid-bodies`` tracker: queries carried by the motions of a fit."""
 
 from dataclasses import fields
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from pydantic import Field
 
 from flowlab.records import Clip, Tracks2D
@@ -12,10 +12,10 @@ from flowlab.tracking.base import Tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
 from flowlab.tracking.trackers.lucas_kanade import LucasKanade
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
-from flowlab.tracking.trackers.rigid_bodies.fit import fit
+from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
 
-_LEAST_FRAMES = 3
+_MIN_FRAMES = 3
 """A shorter clip shows no motion to fit."""
 
 
@@ -67,10 +67,10 @@ class RigidBodiesSession:
         clip = Clip(self._clip.rgb[first:stop], self._clip.depth[first:stop], self._clip.camera)
         z = depth_at(clip.depth[0], xy)
         deep = np.flatnonzero((z > 0) & (z < self._options.max_depth))
-        if len(clip) < _LEAST_FRAMES or len(deep) == 0:
+        if len(clip) < _MIN_FRAMES or len(deep) == 0:
             return _followed(clip, xy)
         pictures = extract_features(clip, self._options.max_depth)
-        carried = propagate(fit(pictures, self._options.seed), pictures.to_own(xy[deep]), z[deep])
+        carried = propagate(fit_bodies(pictures, self._options.seed), pictures.from_clip_pixels(xy[deep]), z[deep])
         explained = deep[carried.cost < self._options.unexplained]
         tracks = _followed(clip, xy, np.setdiff1d(np.arange(len(xy)), explained))
         _put(tracks, explained, _modeled(pictures, carried, carried.cost < self._options.unexplained))
@@ -79,7 +79,7 @@ class RigidBodiesSession:
         return tracks
 
 
-def depth_at(depth: Float32[np.ndarray, "H W"], xy: np.ndarray) -> Float32[np.ndarray, "M"]:
+def depth_at(depth: Float32[np.ndarray, "H W"], xy: Float[np.ndarray, "M 2"]) -> Float32[np.ndarray, "M"]:
     """The reading [m] at the pixel nearest to each point (M, 2); 0 where there is none."""
     column, row = np.rint(xy).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
@@ -99,7 +99,8 @@ def _blank(frames: int, xy: np.ndarray) -> Tracks2D:
     shape = (frames, len(xy))
     held = np.broadcast_to(xy.astype(np.float32), (*shape, 2)).copy()
     zero, minus = np.zeros(shape, np.float32), np.full(shape, -1, np.float32)
-    return Tracks2D(held, np.zeros(shape, bool), zero, minus, minus.copy(), zero.copy(), minus.copy())
+    nowhere = np.zeros((*shape, 3), np.float32)
+    return Tracks2D(held, np.zeros(shape, bool), zero, minus, minus.copy(), nowhere, minus.copy())
 
 
 def _put(tracks: Tracks2D, columns: np.ndarray, part: Tracks2D, rows: slice = slice(None)) -> None:
@@ -116,8 +117,8 @@ def _modeled(pictures: ClipFeatures, carried: PropagatedTracks, of: np.ndarray) 
     z = xyz[..., 2]
     ahead = z > 0.05
     # A point that the motion takes behind the camera is nowhere in the picture: it is left at its border.
-    size = pictures.size_of_clip
-    xy = np.clip(pictures.to_clip(pictures.project(xyz)), -size, 2 * size)
+    size = pictures.clip_size
+    xy = np.clip(pictures.to_clip_pixels(pictures.project(xyz)), -size, 2 * size)
     cost = np.broadcast_to(carried.cost[of], z.shape)
     focal = pictures.K[0, 0] * pictures.factor
     return Tracks2D(
@@ -125,6 +126,6 @@ def _modeled(pictures: ClipFeatures, carried: PropagatedTracks, of: np.ndarray) 
         seen & ahead,
         (1 - cost).clip(0, 1).astype(np.float32),
         disagreement=(carried.spread[:, of] * focal / np.maximum(z, 0.05)).astype(np.float32),
-        depth=np.where(ahead, z, 0).astype(np.float32),
+        xyz_cam=np.where(ahead[..., None], xyz, 0).astype(np.float32),
         residual=carried.residual[:, of],
     )

@@ -1,0 +1,95 @@
+"""The recipe of an experiment: what is compared with what, and how long."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
+
+from flowlab.config import Settings, explain, read_named
+from flowlab.errors import UsageError, unknown_name
+from flowlab.evaluation.trials import Trial, list_trials
+from flowlab.sim.tasks import GROUPS, select_tasks
+
+
+class PolicyVariant(Settings):
+    """A policy with other settings."""
+
+    name: str
+    """What is added to the policy's name."""
+    tasks: tuple[str, ...]
+    """Tasks or groups; those that are not among the experiment's are left out."""
+    set: tuple[str, ...]
+    """Settings of training, as for ``flowlab train --set``."""
+    policy: str = "fdp"
+    """Name or import path of its kind."""
+
+
+class ExperimentRecipe(Settings):
+    """What is compared with what, and how long."""
+
+    name: str
+    description: str = ""
+    tasks: tuple[str, ...] = Field(min_length=1)
+    """Tasks or groups."""
+    policies: tuple[str, ...] = Field(min_length=1)
+    demonstrations: PositiveInt
+    """Trained on, of each task; one more is held out."""
+    recipe: str
+    """Of the datasets."""
+    query_points: PositiveInt
+    """In the datasets; a policy takes as many of them as its settings say."""
+    profile: str
+    """Of training."""
+    minutes: PositiveFloat
+    """Of training: CPU time of one thread, and on a GPU by the clock."""
+    set: tuple[str, ...] = ()
+    """Settings of training for all, as for ``flowlab train --set``."""
+    seeds: tuple[int, ...]
+    episodes: PositiveInt
+    """Of each seed."""
+    curve_episodes: int = Field(ge=0)
+    """Of the first seed, for every checkpoint but the last; 0 draws no learning curves."""
+    variants: tuple[PolicyVariant, ...] = ()
+    device: str = "auto"
+
+
+def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
+    """A recipe by file, or by the name of one that comes with flowlab, with other values for some of its keys.
+
+    Raises :class:`UsageError` naming what is missing, unknown or wrong.
+    """
+    try:
+        values = yaml.safe_load(read_named("experiment", name, "bench"))
+    except yaml.YAMLError as error:
+        raise UsageError(f"experiment {name}: not valid YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise UsageError(f"experiment {name}: is a mapping with the keys {', '.join(ExperimentRecipe.model_fields)}")
+    try:
+        return ExperimentRecipe.model_validate({**values, **changes})
+    except ValidationError as error:
+        raise UsageError(f"experiment {name}: {explain(error, ExperimentRecipe)}") from error
+
+
+def with_variants(recipe: ExperimentRecipe, names: Sequence[str]) -> ExperimentRecipe:
+    """Only these of the variants. Raises :class:`UsageError` where the recipe has none of a name."""
+    known = {v.name: v for v in recipe.variants}
+    for name in names:
+        if name not in known:
+            raise unknown_name("variant of this recipe", name, known)
+    return recipe.model_copy(update={"variants": tuple(known[name] for name in names)})
+
+
+def expand_tasks(names: Sequence[str]) -> tuple[str, ...]:
+    """The tasks of a list of tasks and groups of them. Raises :class:`UsageError` where a name does not exist."""
+    return select_tasks([n for n in names if n not in GROUPS], [n for n in names if n in GROUPS])
+
+
+def curve_trials(recipe: ExperimentRecipe, task: str) -> list[Trial]:
+    """The episodes for every checkpoint but the last."""
+    return list_trials([task], recipe.seeds[:1], recipe.curve_episodes) if recipe.curve_episodes else []
+
+
+def final_trials(recipe: ExperimentRecipe, task: str) -> list[Trial]:
+    """The episodes for the last checkpoint."""
+    return list_trials([task], recipe.seeds, recipe.episodes)

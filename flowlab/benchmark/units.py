@@ -1,0 +1,87 @@
+"""The units of an experiment: each one policy on one task, with all its settings."""
+
+from collections import Counter
+
+from flowlab.benchmark.recipe import ExperimentRecipe, PolicyVariant, expand_tasks, final_trials
+from flowlab.config import Settings
+from flowlab.data.settings import TrainSettings
+from flowlab.engines.base import core_count
+from flowlab.errors import UsageError, unknown_name
+from flowlab.policies.settings import AnyTrainSettings, load_settings
+from flowlab.registry import POLICIES
+
+DATA = "data"
+"""Folder of an experiment that holds its datasets."""
+
+
+class ExperimentUnit(Settings):
+    """One policy: what a worker trains and evaluates."""
+
+    name: str
+    label: str
+    task: str
+    dataset: str
+    """Folder below the experiment's."""
+    settings: AnyTrainSettings
+
+
+def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
+    """Every unit, the policies' own before the variants.
+
+    Raises:
+        UsageError: A name does not exist or stands for two, or settings do not fit each other.
+    """
+    final_trials(recipe, recipe.tasks[0])  # seeds and episodes must exist
+    for name in recipe.policies:
+        if ":" not in name and name not in POLICIES.plugins():
+            raise unknown_name("policy", name, POLICIES.plugins())
+    tasks = expand_tasks(recipe.tasks)
+    units = [_unit(recipe, task, policy) for task in tasks for policy in recipe.policies]
+    for variant in recipe.variants:
+        units += [_unit(recipe, t, variant.policy, variant) for t in expand_tasks(variant.tasks) if t in tasks]
+    for name, times in Counter(u.name for u in units).items():
+        if times > 1:
+            raise UsageError(f"experiment {recipe.name}: {times} units are called {name}; give every variant a name")
+    return units
+
+
+def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) -> str:
+    """A sentence on how long training will take."""
+    workers = workers or core_count()
+    hours = units * recipe.minutes / 60
+    return (
+        f"{units} policies, {recipe.minutes:g} minutes of training each: {hours:.1f} hours of one core, "
+        f"{hours / workers:.1f} on {workers}"
+    )
+
+
+def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVariant | None = None) -> ExperimentUnit:
+    label = policy if variant is None else f"{policy}-{variant.name}"
+    changes = [
+        f"data.demonstrations={recipe.demonstrations}",
+        "data.held_out=1",
+        f"run.minutes={recipe.minutes}",
+        "run.steps=null",
+        *recipe.set,
+        *(variant.set if variant else ()),
+    ]
+    settings = load_settings(recipe.profile, policy, changes)
+    flow, sampling = settings.needs.flow, sampling_of(settings)
+    if flow is not None and flow.points > recipe.query_points:
+        raise UsageError(
+            f"experiment {recipe.name}: {task}-{label} wants {flow.points} query points, and the datasets get "
+            f"{recipe.query_points}; raise query_points"
+        )
+    return ExperimentUnit(
+        name=f"{task}-{label}",
+        label=label,
+        task=task,
+        dataset=f"{DATA}/{task}" + ("" if sampling == "scene" else f"-{sampling}"),
+        settings=settings,
+    )
+
+
+def sampling_of(settings: TrainSettings) -> str:
+    """Which query points the dataset of a policy gets; a policy that follows none takes what there is for others."""
+    flow = settings.needs.flow
+    return "scene" if flow is None else flow.sampling

@@ -1,0 +1,100 @@
+"""What a robot's program hands to a policy: checked, refused in a sentence where it does not fit."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from flowlab.errors import UsageError
+from flowlab.geometry.camera import Camera
+from flowlab.perception.observer import Box
+from flowlab.records import Entity, Frame, Role
+
+_MADE_UP_SIZE = 640, 480
+"""Width and height of the picture that a warm-up makes up [px]."""
+
+
+def check_state(state: Float[np.ndarray, "..."], width: int) -> Float32[np.ndarray, "S"]:
+    """The robot's state as numbers of single precision.
+
+    Args:
+        state: What was given.
+        width: How many numbers the policy was trained on.
+
+    Raises:
+        UsageError: It has another shape, or is not finite.
+    """
+    found = np.asarray(state)
+    if found.shape != (width,):
+        raise UsageError(
+            f"state has the shape {found.shape}, and the policy was trained on states of shape ({width},); give the "
+            "same numbers in the same order"
+        )
+    if not np.isfinite(found).all():
+        raise UsageError(f"state[{np.argmin(np.isfinite(found))}] is no finite number: {found}")
+    return found.astype(np.float32)
+
+
+def check_frame(frame: Frame) -> Frame:
+    """The frame, laid out in memory as the Observer's code was compiled for: else it would be, again, now.
+
+    Raises:
+        UsageError: Depth, color and camera do not fit each other, or depth is not in meters.
+    """
+    depth, camera = np.asarray(frame.depth), frame.camera
+    size = camera.height, camera.width
+    if depth.shape != size:
+        raise UsageError(
+            f"depth has the shape {depth.shape}, and its camera has {camera.height} rows and {camera.width} columns; "
+            "give the camera of this very picture"
+        )
+    if depth.dtype.kind != "f":
+        raise UsageError(
+            f"depth is {depth.dtype}; give meters as float32, of millimeters (depth / 1000).astype(np.float32)"
+        )
+    for name, shape in (("K", (3, 3)), ("T_world_cam", (4, 4))):
+        if np.shape(getattr(camera, name)) != shape:
+            raise UsageError(f"camera.{name} has the shape {np.shape(getattr(camera, name))}, expected {shape}")
+    plain = replace(
+        camera, K=_contiguous(camera.K, np.float64), T_world_cam=_contiguous(camera.T_world_cam, np.float64)
+    )
+    return replace(frame, depth=_contiguous(depth, np.float32), camera=plain)
+
+
+def explain_empty_cloud(frame: Frame, workspace: Box) -> str:
+    """What to look at where no point of a frame lies in the workspace."""
+    v, u = np.nonzero(frame.depth > 0)
+    if not len(v):
+        return "the frame has no depth reading at all; look at what the camera gives"
+    xyz = frame.camera.unproject(np.stack([u, v], -1), frame.depth[v, u])
+    return (
+        f"the frame shows nothing in the policy's workspace, {_extent(np.array([workspace.low, workspace.high]))}; its "
+        f"points are at {_extent(xyz)}: look whether depth is in meters, and camera.T_world_cam leads to the world "
+        "frame of the training data"
+    )
+
+
+def made_up_frame(workspace: Box) -> Frame:
+    """A box on a table in the middle of the workspace, from above."""
+    low, high = np.array(workspace.low), np.array(workspace.high)
+    middle, size = (low + high) / 2, high - low
+    distance = size[:2].max()
+    looking_down = np.diag([1.0, -1, -1, 1])
+    looking_down[:3, 3] = middle
+    looking_down[2, 3] += distance
+    width, height = _MADE_UP_SIZE
+    camera = Camera.from_fovy(width, height, 50.0, looking_down)
+    depth = np.full((height, width), distance, np.float32)
+    depth[height // 4 : -height // 4, width // 4 : -width // 4] -= min(size[2] / 4, distance / 4)
+    box = (Entity("box", "box", Role.OBJECT),)  # what owns a pixel is asked for by some policies
+    return Frame(depth, camera, np.zeros(depth.shape, np.int16), box, np.zeros((height, width, 3), np.uint8))
+
+
+def _extent(xyz: Float[np.ndarray, "N 3"]) -> str:
+    low, high = xyz.min(0), xyz.max(0)
+    return ", ".join(f"{axis} {low[a]:.2f} to {high[a]:.2f}" for a, axis in enumerate("xyz")) + " m"
+
+
+def _contiguous(array: np.ndarray, kind: type[np.floating]) -> np.ndarray:
+    """Of a type, writeable and in C order; the same array where it is so already."""
+    return np.require(array, kind, ["C", "W"])

@@ -1,0 +1,117 @@
+"""Checkpoints to be evaluated, and what is kept of their evaluations in the run's folder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from flowlab.errors import DataError, UsageError, unknown_name
+from flowlab.evaluation.episode_log import EPISODES, read_results
+from flowlab.evaluation.results import CheckpointEvaluation
+from flowlab.evaluation.trials import Trial
+from flowlab.policies.checkpoint import CHECKPOINTS, TrainedPolicy, newest_checkpoint, read_trained, step_of
+from flowlab.sim.simulation import SceneSettings
+
+FOLDER = "evaluation"
+"""Of a run: holds a folder for every checkpoint and number of executed steps."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointRef:
+    """A checkpoint to be evaluated."""
+
+    run: Path
+    weights: Path
+    step: int
+    n_action_steps: int
+    """Steps of every plan that are executed."""
+    trained: TrainedPolicy
+
+    @property
+    def episodes(self) -> Path:
+        """The file that keeps how its episodes went."""
+        return self.run / FOLDER / f"step-{self.step:08d}-execute-{self.n_action_steps}" / EPISODES
+
+    @property
+    def scene(self) -> SceneSettings:
+        """The simulated scene that its policy knows, with color where the policy needs it."""
+        color = self.trained.policy.settings.needs.rgb
+        return SceneSettings.model_validate(self.trained.scene).model_copy(update={"rgb": color})
+
+    def read_evaluation(self, trials: Sequence[Trial]) -> CheckpointEvaluation:
+        """Those of the trials that have been tried."""
+        known = read_results(self.episodes)
+        outcomes = tuple(known[t] for t in trials if t in known)
+        return CheckpointEvaluation(step=self.step, n_action_steps=self.n_action_steps, outcomes=outcomes)
+
+
+def find_checkpoint(path: Path, n_action_steps: int | None = None) -> CheckpointRef:
+    """The newest checkpoint of a run, or the one that is given.
+
+    Args:
+        path: The folder of a run, or one of its checkpoints.
+        n_action_steps: Steps of every plan to execute; None executes as many as the policy was trained to.
+
+    Raises:
+        DataError: There is no checkpoint, or the policy was not trained in simulation.
+        UsageError: Its plans are shorter than ``n_action_steps`` steps.
+    """
+    weights = newest_checkpoint(path) if path.suffix != ".safetensors" else path
+    run = weights.absolute().parents[1] if path.suffix == ".safetensors" else path
+    trained = read_trained(run)
+    s = trained.policy.settings
+    if trained.scene is None or (trained.policy.observer is None and _needs_cloud(trained)):
+        raise DataError(
+            f"{path}: was trained on recordings or on a DP3 store ({trained.dataset}), so no simulation shows what it "
+            f"knows; compare it with held-out demonstrations by 'flowlab eval {path} --offline'"
+        )
+    if s.needs.rgb and not trained.scene.get("rgb"):
+        raise DataError(
+            f"{path}: needs color, and the scene that it was trained in has none; train it on a dataset that was made "
+            "with --renderer gl --set expert.scene.rgb=true"
+        )
+    most = s.horizon - s.n_obs_steps + 1
+    if n_action_steps is not None and not 1 <= n_action_steps <= most:
+        raise UsageError(f"--execute {n_action_steps}: {path} plans {most} steps ahead, so execute 1 to {most}")
+    return CheckpointRef(run, weights, step_of(weights), n_action_steps or s.n_action_steps, trained)
+
+
+def find_checkpoints(run: Path, n_action_steps: int | None = None) -> list[CheckpointRef]:
+    """Every checkpoint of a run, oldest first. Raises what :func:`find_checkpoint` does."""
+    newest_checkpoint(run)
+    return [find_checkpoint(path, n_action_steps) for path in sorted((run / CHECKPOINTS).glob("step-*.safetensors"))]
+
+
+def common_tasks(checkpoints: Sequence[CheckpointRef], asked: Sequence[str] = ()) -> tuple[str, ...]:
+    """The tasks that are asked for, or else all that every policy knows.
+
+    Raises:
+        UsageError: A policy does not know a task that is asked for, or there is none that all know.
+    """
+    known = [set(c.trained.policy.tasks) for c in checkpoints]
+    for checkpoint, tasks in zip(checkpoints, known, strict=True):
+        for task in asked:
+            if task not in tasks:
+                raise UsageError(f"{checkpoint.run}: {unknown_name('task that it was trained on', task, tasks)}")
+    common = set.intersection(*known)
+    if not common:
+        each = "; ".join(f"{c.run} {', '.join(sorted(k))}" for c, k in zip(checkpoints, known, strict=True))
+        raise UsageError(f"no task is common to all runs ({each}); evaluate them apart, or make one report of them")
+    return tuple(dict.fromkeys(asked)) or tuple(sorted(common))
+
+
+def _needs_cloud(trained: TrainedPolicy) -> bool:
+    needs = trained.policy.settings.needs
+    return needs.point_cloud is not None or needs.flow is not None
+
+
+def read_evaluations(run: Path) -> list[CheckpointEvaluation]:
+    """All that is kept of a run's evaluations, in order of steps."""
+    found = []
+    for folder in sorted((run / FOLDER).glob("step-*-execute-*")):
+        _, step, _, n_action_steps = folder.name.split("-")
+        outcomes = sorted(read_results(folder / EPISODES).values(), key=lambda o: o.trial)
+        if outcomes:
+            found.append(
+                CheckpointEvaluation(step=int(step), n_action_steps=int(n_action_steps), outcomes=tuple(outcomes))
+            )
+    return found

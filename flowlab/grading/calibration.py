@@ -1,0 +1,59 @@
+"""Stated errors compared with true ones."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+SIGMA_EDGES_MM = (0.0, *(float(2 ** (k / 2)) for k in range(-2, 15)), float("inf"))
+"""Limits of the bins of stated error, two to an octave: 0, 0.5, 0.71, 1, ... 128, and no limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Stated errors beside true ones, over every answered pair, seen or not."""
+
+    n: int
+    within_1_sigma: float
+    """Share of errors below the stated one; 0.68 is meant."""
+    within_2_sigma: float
+    rank_correlation: float
+    """Spearman's, of stated with true errors."""
+    count: tuple[int, ...]
+    """Pairs in each bin of ``SIGMA_EDGES_MM``."""
+    stated_mm: tuple[float, ...]
+    """Median stated error of each bin; not a number where it is empty."""
+    true_mm: tuple[float, ...]
+    """68th percentile of the true errors of each bin: on the diagonal, if sigma is right."""
+
+
+def calibrate(error_m: Float[np.ndarray, "*batch"], sigma_m: Float[np.ndarray, "*batch"]) -> Calibration | None:
+    """What stated errors are worth; pairs without an answer are left out. None where none remains."""
+    known = np.isfinite(error_m) & np.isfinite(sigma_m)
+    error, sigma = error_m[known] * 1e3, sigma_m[known] * 1e3
+    if len(error) == 0:
+        return None
+    which = np.digitize(sigma, SIGMA_EDGES_MM[1:-1])
+    bins = [which == k for k in range(len(SIGMA_EDGES_MM) - 1)]
+    return Calibration(
+        n=len(error),
+        within_1_sigma=float((error < sigma).mean()),
+        within_2_sigma=float((error < 2 * sigma).mean()),
+        rank_correlation=rank_correlation(sigma, error),
+        count=tuple(int(b.sum()) for b in bins),
+        stated_mm=tuple(float(np.median(sigma[b])) if b.any() else np.nan for b in bins),
+        true_mm=tuple(float(np.percentile(error[b], 68)) if b.any() else np.nan for b in bins),
+    )
+
+
+def rank_correlation(a: Float[np.ndarray, "K"], b: Float[np.ndarray, "K"]) -> float:
+    """Spearman's; ties share their mean rank. Not a number where one of the two is constant."""
+    x, y = _ranks(a), _ranks(b)
+    x, y = x - x.mean(), y - y.mean()
+    spread = np.sqrt((x**2).sum() * (y**2).sum())
+    return float((x * y).sum() / spread) if spread > 0 else float("nan")
+
+
+def _ranks(values: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[place]

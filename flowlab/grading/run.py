@@ -1,0 +1,172 @@
+"""A whole grading run: recordings found or simulated, labeled by some trackers, and compared with their truth."""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flowlab.errors import FlowlabError, MissingLibraryError, UsageError, unknown_name
+from flowlab.files import write_json
+from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_tracker
+from flowlab.grading.ground_truth import find_with_truth
+from flowlab.tracking.base import Tracker, make_tracker
+from flowlab.tracking.chunking import ChunkSettings
+from flowlab.tracking.lifting import LiftSettings
+
+REPORT = "grade.json"
+
+
+@dataclass(frozen=True, slots=True)
+class GradingReport:
+    """What some trackers make of some recordings."""
+
+    chunks: ChunkSettings
+    simulated: Mapping[str, Any] | None
+    """How recordings were simulated, as JSON values; None where none was."""
+    trackers: tuple[TrackerGrade, ...]
+
+    @property
+    def about(self) -> str:
+        """How much was graded, in words."""
+        rows = self.trackers[0].rows
+        frames, queries = sum(r.frames for r in rows), sum(r.queries for r in rows)
+        return f"{len(rows)} recordings, {frames} frames, {queries} query points"
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures and the settings they were taken with, as JSON values."""
+        return {
+            "chunks": self.chunks.model_dump(mode="json"),
+            "simulated": self.simulated,
+            "trackers": [t.to_json() for t in self.trackers],
+        }
+
+
+def grade(
+    recordings: Sequence[Path | str] = (),
+    out: Path | str = "grade",
+    *,
+    trackers: Sequence[str] = ("rigid-bodies",),
+    tasks: Sequence[str] = (),
+    episodes: int = 1,
+    seed: int = 0,
+    sensor: str = "kinect",
+    size: tuple[int, int] = (320, 240),
+    settings: Sequence[str] = (),
+    weights: Path | None = None,
+    chunks: ChunkSettings = ChunkSettings(),
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> GradingReport:
+    """Label recordings whose truth is known, without looking at it, and say how far off the labels are.
+
+    Args:
+        recordings: Folders with a ``ground_truth.npz``, or that hold such folders.
+        out: Folder to write: ``grade.json``, and the simulated recordings, which the next run uses again.
+        trackers: Names of trackers, or import paths ``module:Class``.
+        tasks: MetaWorld's tasks, or groups of them, whose experts are recorded by a simulated depth camera.
+        episodes: Recordings of each task.
+        seed: Of the first of them.
+        sensor: What the simulated camera errs like, ``kinect`` or ``clean``.
+        size: Width and height of its pictures [px].
+        settings: ``key=value`` of every tracker's options, or ``tracker.key=value`` of one tracker's.
+        weights: File of a learned tracker's weights.
+        chunks: How a recording is cut for trackers that take it in parts.
+        on_progress: Is told in words what is done.
+
+    Returns:
+        Every figure, by tracker and recording.
+
+    Raises:
+        UsageError: There is nothing to grade, or a name or an option does not exist.
+        DataError: A recording cannot be read, or its truth is not known.
+        FlowlabError: The folder cannot be written, or a library is missing.
+    """
+    if not recordings and not tasks:
+        raise UsageError("nothing to grade; give folders with a ground_truth.npz, or --tasks hammer,door-open")
+    out = Path(out)
+    made = [make_graded_tracker(name, trackers, settings, weights) for name in dict.fromkeys(trackers)]
+    folders = [folder for path in recordings for folder in find_with_truth(Path(path))]
+    simulated = None
+    if tasks:
+        more, simulated = _simulate(tasks, range(seed, seed + episodes), sensor, size, out, on_progress)
+        folders += more
+    folders = list({folder.resolve(): folder for folder in folders}.values())
+
+    def tell(row: RecordingGrade) -> None:
+        on_progress(f"{row.recording}: {row.frames} frames in {row.cpu_s:.1f} s of CPU time")
+
+    results = []
+    for tracker in made:
+        on_progress(f"labeling with {tracker.name}")
+        results.append(grade_tracker(folders, tracker, chunks, LiftSettings(), report=tell))
+    report = GradingReport(chunks, simulated, tuple(results))
+    with _writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / REPORT, report.to_json())
+    return report
+
+
+def make_graded_tracker(name: str, names: Sequence[str], settings: Sequence[str], weights: Path | None) -> Tracker:
+    """A tracker with the options that are meant for it: those without a tracker's name are for all of ``names``."""
+    options: dict[str, Any] = {} if weights is None else {"weights": str(weights)}
+    for change in settings:
+        key, equals, value = change.partition("=")
+        whose, _, option = key.rpartition(".")
+        if not equals or not option:
+            raise UsageError(f"--set {change}: must look like KEY=VALUE, or {names[0]}.KEY=VALUE for one tracker")
+        if whose and whose not in names:
+            raise UsageError(f"--set {change}: {unknown_name('tracker of this run', whose, names)}")
+        if whose in ("", name):
+            try:
+                options[option] = yaml.safe_load(value)
+            except yaml.YAMLError as error:
+                raise UsageError(f"--set {change}: not valid YAML: '{value}'") from error
+    return make_tracker(name, options)
+
+
+def _simulate(
+    names: Sequence[str],
+    seeds: range,
+    sensor: str,
+    size: tuple[int, int],
+    out: Path,
+    on_progress: Callable[[str], None],
+) -> tuple[list[Path], dict[str, Any]]:
+    """Record what is not there yet; the folders of all, and how they are made."""
+    _import_mujoco()
+    from flowlab.grading.simulate import SimulatedRecording, simulate_recording
+    from flowlab.sim.tasks import GROUPS, select_tasks
+
+    how = SimulatedRecording.with_camera(sensor, size)
+    folders = []
+    for task in select_tasks([n for n in names if n not in GROUPS], [n for n in names if n in GROUPS]):
+        for seed in seeds:
+            folder = out / "recordings" / f"{task}-{seed}"
+            with _writing(out):
+                made = simulate_recording(folder, task, seed, how)
+            on_progress(f"{folder}: {'recorded' if made else 'there already'}")
+            folders.append(folder)
+    return folders, how.model_dump(mode="json")
+
+
+def _import_mujoco() -> None:
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:
+        if "MUJOCO_GL" not in os.environ:
+            raise
+        raise MissingLibraryError(
+            f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
+            "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
+        ) from error
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise FlowlabError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error

@@ -1,0 +1,167 @@
+"""A recording whose layout is understood: its streams, what is known of it, which frames are bad."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from pydantic import Field
+
+from flowlab.config import Settings
+from flowlab.errors import DataError
+from flowlab.recordings.base import Reader, Streams, choose_reader
+from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
+from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
+from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
+from flowlab.recordings.sample_files import load_samples
+from flowlab.recordings.sync import last_sample, nearest_sample
+
+
+class RecordingSettings(Settings):
+    """How recordings are read."""
+
+    reader: str | None = None
+    """Name of the reader to use; else the one that recognizes the recording."""
+    calibration: Path | None = None
+    """A YAML file with the keys of ``recording.yaml``, for every recording; it wins over their own."""
+    max_sync_s: float = Field(default=0.02, gt=0)
+    """A color frame without a depth frame this near [s] is bad."""
+    max_state_s: float = Field(default=0.1, gt=0)
+    """A color frame without a sample of robot state this near [s] is bad."""
+    bad_frames: Literal["skip", "reject"] = "skip"
+    """What to do with bad frames: leave them out, or reject the recording."""
+    max_bad_share: float = Field(default=0.1, ge=0, le=1)
+    """A recording with a greater share of bad frames is rejected all the same."""
+    max_width: int = Field(default=640, gt=0)
+    """Larger pictures are shrunk by a whole factor [px]."""
+    every: int = Field(default=1, gt=0)
+    """Take every n-th color frame."""
+    start_s: float = Field(default=0.0, ge=0)
+    """Leave out what was before, since the first color frame [s]."""
+    stop_s: float | None = Field(default=None, gt=0)
+    """Leave out what was after, since the first color frame [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedSamples:
+    """The numbers of every row."""
+
+    clock_s: Float64[np.ndarray, "T"]
+    """On the clock of the recording."""
+    state: Float32[np.ndarray, "T S"]
+    action: Float32[np.ndarray, "T A"]
+    action_source: str
+    """How the action was found, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParsedRecording:
+    """A recording whose layout is understood."""
+
+    path: Path
+    reader: Reader
+    streams: Streams
+    metadata: Metadata
+    origin: Mapping[str, str]
+    frame_check: FrameCheck
+
+    @property
+    def write_to(self) -> str:
+        """What errors tell the user to write into."""
+        file = self.path / FILE_NAME if self.path.is_dir() else self.path.with_suffix(".yaml")
+        return f"{file} (or the calibration file)"
+
+    def frame_processor(self, settings: RecordingSettings) -> FrameProcessor:
+        """What makes frames of it. Raises :class:`DataError` where calibration is missing or cannot be."""
+        seen = self.frame_check
+        if not len(seen.color):
+            first = f"; {seen.bad[0].name} {seen.bad[0].reason}" if seen.bad else ""
+            raise DataError(f"{self.path}: none of {seen.looked_at} frames can be used{first}")
+        return make_frame_processor(
+            self.path,
+            self.metadata,
+            seen.color_size,
+            seen.depth_size,
+            registered=self.streams.registered,
+            max_width=settings.max_width,
+            write_to=self.write_to,
+            median_counts=seen.median_counts,
+        )
+
+    def check_bad_frames(self, settings: RecordingSettings) -> None:
+        """Raise :class:`DataError` where there are more bad frames than the settings allow."""
+        seen = self.frame_check
+        allowed = 0.0 if settings.bad_frames == "reject" else settings.max_bad_share
+        if len(seen.bad) > allowed * seen.looked_at or len(seen.color) < 2:
+            some = "; ".join(f"{b.name} {b.reason}" for b in seen.bad[:3]) or "there are no others"
+            raise DataError(
+                f"{self.path}: {len(seen.bad)} of {seen.looked_at} frames are bad ({some}), "
+                f"and {'none' if not allowed else f'at most {allowed:.0%}'} may be; see max_bad_share and max_sync_s"
+            )
+
+    def rows(self) -> AlignedSamples:
+        """What the robot was and did at every row."""
+        clock = self.streams.color.time_s[self.frame_check.color]
+        state = align_samples(self.streams.state, clock, nearest_sample)
+        if self.streams.action:
+            action, how = align_samples(self.streams.action, clock, last_sample), "the last one recorded up to the row"
+        elif self.streams.state:
+            action, how = np.concatenate([state[1:], state[-1:]]), "state of the next row"
+        else:
+            action, how = state, "none recorded"
+        return AlignedSamples(clock, state, action, how)
+
+
+def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
+    """Read the streams, find out what is known of them, and look at every picture."""
+    reader = choose_reader(path, settings.reader)
+    given = list(_given(path, settings))
+    streams = reader.read(path, combine(given)[0])
+    for stream in (streams.color, streams.depth):
+        if not len(stream):
+            raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
+    metadata, origin = combine([*given, *streams.known])
+    streams = _with_files(path, streams, metadata)
+    seen = check_frames(
+        streams,
+        every=settings.every,
+        start_s=settings.start_s,
+        stop_s=settings.stop_s,
+        max_sync_s=settings.max_sync_s,
+        max_state_s=settings.max_state_s,
+    )
+    return ParsedRecording(path, reader, streams, metadata, origin, seen)
+
+
+def known_beforehand(path: Path, settings: RecordingSettings) -> Metadata:
+    """What the user says of a recording, in the calibration file and in ``recording.yaml`` in or beside it.
+
+    Raises:
+        DataError: One of these files is not as it should be.
+    """
+    return combine(_given(path, settings))[0]
+
+
+def _given(path: Path, settings: RecordingSettings) -> Iterator[tuple[str, Metadata]]:
+    """What the user says, most important first: the calibration file, then ``recording.yaml`` in or beside it."""
+    if settings.calibration is not None:
+        yield settings.calibration.name, load_metadata(settings.calibration)
+    beside = [path / FILE_NAME] if path.is_dir() else [path.with_suffix(".yaml"), path.parent / FILE_NAME]
+    for file in beside:
+        if file.is_file():
+            yield file.name, load_metadata(file)
+
+
+def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
+    """The streams, with state and actions from files where ``recording.yaml`` names some."""
+    folder = path if path.is_dir() else path.parent
+    changed: dict[str, Any] = {}
+    for name in ("state", "action"):
+        file, times = getattr(metadata, name), getattr(metadata, f"{name}_times")
+        if file is not None:
+            where = None if times is None else folder / times
+            samples = load_samples(folder / file, name, where, streams.color.time_s, FILE_NAME)
+            changed[name] = (samples,)
+    return replace(streams, **changed)

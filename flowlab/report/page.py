@@ -1,0 +1,104 @@
+"""The page of a report, which needs no other file and no network."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+
+from flowlab.benchmark.ordering import ALL
+from flowlab.benchmark.paper import CURVE_TASKS
+from flowlab.benchmark.summary import Summary
+from flowlab.evaluation.results import TrainingRecord
+from flowlab.report.paper_differences import paper_differences
+from flowlab.report.success_rows import episodes_each, success_rows
+from flowlab.report.tables import Table
+from flowlab.version import __version__
+from flowlab.viz.plot_style import DPI, policy_colors
+
+_BASELINES = ("_zero", "_hold", "_constant")
+"""Endings of held-out errors of what needs no training; the first is enough here."""
+
+
+def render_page(
+    summary: Summary,
+    figures: Mapping[str, Path],
+    videos: Sequence[tuple[str, str]] = (),
+    robot_tables: Sequence[Table] = (),
+) -> str:
+    """The page as HTML.
+
+    Args:
+        summary: All numbers.
+        figures: PNGs that the page will hold, as :func:`flowlab.report.figures.draw_figures` returns them.
+        videos: Names and relative addresses of videos to link.
+        robot_tables: Trials on a robot.
+    """
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    environment.filters |= {"percent": _percent, "p": _p_value, "number": _number, "short": _short}
+    template = environment.from_string(files("flowlab.report").joinpath("report.html.j2").read_text("utf-8"))
+    return template.render(
+        s=summary,
+        ALL=ALL,
+        success=success_rows(summary),
+        episodes_each=episodes_each(summary),
+        held_out=held_out_errors(summary),
+        machines=sorted({_machine(f.training) for f in summary.training}),
+        colors=policy_colors(summary.labels),
+        curve_tasks=CURVE_TASKS,
+        differences=paper_differences(summary) if summary.paper else [],
+        figures={name: _Image.of(path.read_bytes()) for name, path in figures.items()},
+        videos=videos,
+        robot_tables=robot_tables,
+        version=__version__,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """A figure within the page."""
+
+    content: str
+    width: int
+    """On a screen, where lengths count 96 to the inch."""
+
+    @classmethod
+    def of(cls, png: bytes) -> "_Image":
+        """A PNG has its width behind its signature and the name of the first chunk."""
+        return cls(base64.b64encode(png).decode(), round(int.from_bytes(png[16:20]) * 96 / DPI))
+
+
+def held_out_errors(summary: Summary) -> dict[str, list[tuple[str, float, float | None]]]:
+    """Errors on held-out demonstrations by the name of the result: each with that of predicting nothing."""
+    return {
+        fact.name: [
+            (name, value, fact.training.held_out.get(f"{name}_zero"))
+            for name, value in sorted(fact.training.held_out.items())
+            if not name.endswith(_BASELINES)
+        ]
+        for fact in summary.training
+    }
+
+
+def _machine(training: TrainingRecord) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in sorted(training.versions.items()))
+    return f"{training.processor}: {versions}"
+
+
+def _percent(share: float, digits: int = 1) -> str:
+    return f"{100 * share:.{digits}f}"
+
+
+def _p_value(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    """With narrow spaces between thousands, where no line breaks; a dash where there is none."""
+    return "–" if value is None else f"{value:,.{digits}f}".replace(",", "\u202f")
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}"

@@ -1,0 +1,136 @@
+"""Results as tables that people read, on a terminal or on the report's page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flowlab.benchmark.ordering import ALL
+from flowlab.benchmark.robot_trials import RobotTrial, comparisons, successes
+from flowlab.benchmark.statistics import Proportion
+from flowlab.benchmark.success import GroupSuccess, TaskSuccess
+from flowlab.benchmark.summary import Summary
+from flowlab.evaluation.offline import OfflineReport
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows below named columns."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[object, ...], ...]
+
+
+def summary_tables(summary: Summary) -> list[Table]:
+    """Success by policy and task, policies against each other, and errors of predicted flow: only what there is."""
+    groups = summary.groups if len(summary.tasks) > 1 else ()
+    success = [_success_row(x.task, x) for x in summary.successes]
+    success += [_success_row(f"{g.group} ({len(g.tasks)} of {g.of})", g) for g in groups]
+    pairs = [
+        (f"{c.first}, {c.second}", p.n, p.both, p.first_only, p.second_only, p.neither, p.p_value)
+        for c in summary.comparisons
+        if c.over == ALL and (p := c.paired)
+    ]
+    flow = [
+        (f.label, e.ade_mm, e.zero_ade_mm, e.fde_mm, e.zero_fde_mm, e.apd, e.average_jaccard)
+        for f in summary.flow
+        if f.over == ALL and (e := f.error)
+    ]
+    tables = [
+        Table(
+            "solved at any step; DP3's runner misses what does not last",
+            ("task", "policy", "solved", "of", "%", "95 % interval", "DP3's reading %", "steps"),
+            tuple(success),
+        ),
+        Table(
+            "on the same episodes; p: McNemar, exact, two-sided",
+            ("policies", "episodes", "both", "first only", "second only", "neither", "p"),
+            tuple(pairs),
+        ),
+        Table(
+            "predicted against true flow of moving points, while a plan is executed",
+            ("policy", "ADE mm", "(no motion)", "FDE mm", "(no motion)", "APD", "3D-AJ"),
+            tuple(flow),
+        ),
+    ]
+    return tables[:1] + [table for table in tables[1:] if table.rows]
+
+
+def robot_trial_tables(trials: Sequence[RobotTrial]) -> list[Table]:
+    """Success of trials on a robot, and policies against each other where they share trials."""
+    counts = [
+        (x.task, x.policy, x.success.successes, x.success.n, _percent(x.success), _interval(x.success))
+        for x in successes(trials)
+    ]
+    pairs = [
+        (c.task, f"{c.first}, {c.second}", p.n, p.both, p.first_only, p.second_only, p.neither, round(p.p_value, 4))
+        for c in comparisons(trials)
+        if (p := c.paired)
+    ]
+    tables = [
+        Table(
+            "trials on a robot; Wilson's intervals",
+            ("task", "policy", "solved", "of", "%", "95 % interval"),
+            tuple(counts),
+        ),
+        Table(
+            "on the same trials; p: McNemar, exact, two-sided",
+            ("task", "policies", "trials", "both", "first only", "second only", "neither", "p"),
+            tuple(pairs),
+        ),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def offline_table(report: OfflineReport, title: str = "") -> Table:
+    """Every error over all demonstrations, beside what needs no policy."""
+    e, flow = report.all.errors, report.all.flow
+    rows: list[tuple[object, ...]] = [("action L1", e.action_l1, e.action_l1_zero, e.action_l1_hold)]
+    if e.flow_moving_mm is not None:
+        rows.append(("flow of moving points mm", e.flow_moving_mm, e.flow_moving_mm_zero, e.flow_moving_mm_constant))
+    if e.flow_static_mm is not None:
+        rows.append(("flow of still points mm", e.flow_static_mm, e.flow_static_mm_zero, e.flow_static_mm_constant))
+    if e.pose_mm is not None:
+        rows.append(("object's position mm", e.pose_mm, e.pose_mm_zero, e.pose_mm_constant))
+    if flow is not None:
+        errors = (flow.policy, flow.zero, flow.constant)
+        for name, field in (("ADE mm", "ade_mm"), ("FDE mm", "fde_mm"), ("APD", "apd"), ("3D-AJ", "average_jaccard")):
+            values = [None if x is None else getattr(x, field) for x in errors]
+            rows.append((f"{name}, mean of {flow.draws} draws", *values))
+        rows.append((f"ADE mm, best of {flow.draws} draws", flow.best_ade_mm, None, None))
+        rows.append((f"FDE mm, best of {flow.draws} draws", flow.best_fde_mm, None, None))
+    return Table(title, ("error", "policy", "no motion", "as before"), tuple(_dashed(row) for row in rows))
+
+
+_DEMONSTRATION_COLUMNS = (
+    "demonstration", "windows", "action L1", "moving mm", "still mm", "pose mm", "FDE mm", "best ADE mm", "3D-AJ",
+)  # fmt: skip
+
+
+def demonstration_table(report: OfflineReport, title: str = "") -> Table:
+    """The policy's own errors on each demonstration, only those that there are."""
+    rows: list[tuple[object, ...]] = []
+    for d in report.demonstrations:
+        e, flow = d.errors, d.flow
+        of_flow = [None] * 3 if flow is None else [flow.policy.fde_mm, flow.best_ade_mm, flow.policy.average_jaccard]
+        found = (e.action_l1, e.flow_moving_mm, e.flow_static_mm, e.pose_mm, *of_flow)
+        rows.append((f"{d.task} {d.seed}", d.windows, *found))
+    kept = [k for k in range(len(_DEMONSTRATION_COLUMNS)) if any(row[k] is not None for row in rows)]
+    columns = tuple(_DEMONSTRATION_COLUMNS[k] for k in kept)
+    return Table(title, columns, tuple(_dashed([row[k] for k in kept]) for row in rows))
+
+
+def _success_row(name: str, x: TaskSuccess | GroupSuccess) -> tuple[object, ...]:
+    counts = x.success.successes, x.success.n, _percent(x.success), _interval(x.success)
+    return name, x.label, *counts, _percent(x.success_dp3), x.mean_steps or "-"
+
+
+def _percent(share: Proportion) -> float:
+    return round(100 * share.share, 1)
+
+
+def _interval(share: Proportion) -> str:
+    return f"{100 * share.low:.0f} - {100 * share.high:.0f}"
+
+
+def _dashed(row: Sequence[object]) -> tuple[object, ...]:
+    return tuple("-" if value is None else value for value in row)

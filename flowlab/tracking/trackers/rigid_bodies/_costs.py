@@ -1,0 +1,192 @@
+"""How badly a rigid motion explains what the pictures show, compiled.
+
+Positions are meters in the camera frame; pixels have integer centers.
+"""
+
+# mypy: ignore-errors
+import numba
+import numpy as np
+
+SURFACE_TOLERANCE = 0.010
+"""A depth this near a claimed surface [m, at up to 1 m; growing with the square of the distance] is that surface."""
+LCN, L, A, B = 0.25 * 3 / 255, 1 / 70, 1 / 30, 1 / 30
+"""What one count of each feature channel costs; costs add up to at most 1."""
+SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
+"""Cost of a body's point where the camera looks through it, where something is in front, and where depth is missing."""
+
+
+@numba.njit(cache=True, inline="always")
+def tolerance(z):
+    """How far a depth reading may lie from a surface at depth z [m]."""
+    return SURFACE_TOLERANCE * max(1.0, z * z)
+
+
+@numba.njit(cache=True)
+def color_cost(feature, u, v, f0):
+    """Difference, 0 to 1, between a feature picture (H, W, 4) at a sub-pixel position and four channel values."""
+    height, width = feature.shape[:2]
+    u = min(max(u, 0.0), width - 1.001)
+    v = min(max(v, 0.0), height - 1.001)
+    j, i = int(u), int(v)
+    a, b = u - j, v - i
+    w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+    p, q, r, s = feature[i, j], feature[i, j + 1], feature[i + 1, j], feature[i + 1, j + 1]
+    cost = abs(w00 * p[0] + w01 * q[0] + w10 * r[0] + w11 * s[0] - f0[0]) * LCN
+    cost += abs(w00 * p[1] + w01 * q[1] + w10 * r[1] + w11 * s[1] - f0[1]) * L
+    cost += abs(w00 * p[2] + w01 * q[2] + w10 * r[2] + w11 * s[2] - f0[2]) * A
+    cost += abs(w00 * p[3] + w01 * q[3] + w10 * r[3] + w11 * s[3] - f0[3]) * B
+    return min(cost, 1.0)
+
+
+@numba.njit(cache=True)
+def features_at(feature, uv):
+    """The four channels (n, 4) at sub-pixel positions (n, 2)."""
+    height, width = feature.shape[:2]
+    out = np.empty((len(uv), 4), np.float32)
+    for k in range(len(uv)):
+        u = min(max(uv[k, 0], 0.0), width - 1.001)
+        v = min(max(uv[k, 1], 0.0), height - 1.001)
+        j, i = int(u), int(v)
+        a, b = u - j, v - i
+        for c in range(4):
+            top = (1 - a) * feature[i, j, c] + a * feature[i, j + 1, c]
+            out[k, c] = (1 - b) * top + b * ((1 - a) * feature[i + 1, j, c] + a * feature[i + 1, j + 1, c])
+    return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def energies(points, point_features, R, t, depth, feature, K, every):
+    """How badly each body at each candidate pose explains a frame.
+
+    points (B, n, 3), point_features (B, n, 4), R (B, C, 3, 3), t (B, C, 3); of the points each ``every``-th is
+    looked at. Returns the mean energy (B, C) and the share of points seen in place (B, C).
+    """
+    bodies, candidates = R.shape[:2]
+    height, width = depth.shape
+    n = points.shape[1]
+    energy = np.empty((bodies, candidates))
+    seen = np.empty((bodies, candidates))
+    for b in range(bodies):
+        for c in range(candidates):
+            Q, s = R[b, c], t[b, c]
+            total, fits, looked = 0.0, 0, 0
+            for k in range(0, n, every):
+                p = points[b, k]
+                looked += 1
+                z = Q[2, 0] * p[0] + Q[2, 1] * p[1] + Q[2, 2] * p[2] + s[2]
+                if z <= 0.05:
+                    total += HIDDEN
+                    continue
+                u = (Q[0, 0] * p[0] + Q[0, 1] * p[1] + Q[0, 2] * p[2] + s[0]) / z * K[0, 0] + K[0, 2]
+                v = (Q[1, 0] * p[0] + Q[1, 1] * p[1] + Q[1, 2] * p[2] + s[1]) / z * K[1, 1] + K[1, 2]
+                if not (u > 0 and v > 0 and u < width - 1 and v < height - 1):
+                    total += HIDDEN
+                    continue
+                d = depth[int(v + 0.5), int(u + 0.5)]
+                if d == 0:
+                    total += HOLE + 0.7 * color_cost(feature, u, v, point_features[b, k])
+                    continue
+                off = abs(d - z) / (0.6 * tolerance(z))
+                if off < 2.5:
+                    total += color_cost(feature, u, v, point_features[b, k]) + 0.4 * off
+                    fits += 1
+                else:
+                    total += SEEN_BEHIND if d > z else HIDDEN
+            energy[b, c] = total / looked
+            seen[b, c] = fits / looked
+    return energy, seen
+
+
+@numba.njit(cache=True)
+def motion_costs(points, point_features, frames, R, t, depth, feature, K):
+    """How badly each of B motions explains each of n frame-0 points, over some frames.
+
+    points (n, 3), point_features (n, 4), frames (F,), R (B, T, 3, 3), t (B, T, 3), depth (T, H, W),
+    feature (T, H, W, 4).
+    Returns the mean cost (B, n) and the share of frames (B, n) in which the motion takes the point more than 1 cm.
+    """
+    bodies = len(R)
+    height, width = depth.shape[1:]
+    cost = np.zeros((bodies, len(points)), np.float32)
+    moved = np.zeros((bodies, len(points)), np.float32)
+    share = 1 / len(frames)
+    for b in range(bodies):
+        for f in frames:
+            Q, s = R[b, f], t[b, f]
+            for k in range(len(points)):
+                p = points[k]
+                x = Q[0, 0] * p[0] + Q[0, 1] * p[1] + Q[0, 2] * p[2] + s[0]
+                y = Q[1, 0] * p[0] + Q[1, 1] * p[1] + Q[1, 2] * p[2] + s[1]
+                z = Q[2, 0] * p[0] + Q[2, 1] * p[1] + Q[2, 2] * p[2] + s[2]
+                if (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2 > 1e-4:
+                    moved[b, k] += share
+                if z <= 0.05:
+                    cost[b, k] += 0.55
+                    continue
+                u, v = x / z * K[0, 0] + K[0, 2], y / z * K[1, 1] + K[1, 2]
+                if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
+                    cost[b, k] += 0.55
+                    continue
+                off, nearest, farthest = nearest_reading(depth[f], u, v, z)
+                if farthest == 0:
+                    cost[b, k] += 0.35 + 0.5 * color_cost(feature[f], u, v, point_features[k])
+                elif off < tolerance(z):
+                    cost[b, k] += 0.7 * color_cost(feature[f], u, v, point_features[k])
+                    cost[b, k] += 0.35 * min(off / (0.6 * tolerance(z)), 1.0)
+                else:
+                    cost[b, k] += 1.4 if nearest > z else 0.6
+    return cost * np.float32(share), moved
+
+
+@numba.njit(cache=True)
+def nearest_reading(depth, u, v, z):
+    """Of the readings in the 3x3 pixels around (u, v): how near the closest comes to z (among the center's,
+    the least and the greatest), the least, and the greatest; 0 where there is none."""
+    height, width = depth.shape
+    i, j = min(max(int(v + 0.5), 0), height - 1), min(max(int(u + 0.5), 0), width - 1)
+    nearest, farthest = 99.0, 0.0
+    for y in range(max(i - 1, 0), min(i + 2, height)):
+        for x in range(max(j - 1, 0), min(j + 2, width)):
+            d = depth[y, x]
+            if d > 0:
+                nearest, farthest = min(nearest, d), max(farthest, d)
+    off = min(abs(nearest - z), abs(farthest - z))
+    if depth[i, j] > 0:
+        off = min(off, abs(depth[i, j] - z))
+    return off, nearest, farthest
+
+
+@numba.njit(cache=True)
+def residuals(depth, feature, point_features, uv, z):
+    """How badly color and depth fit points at pixels (T, M, 2) and depths (T, M) [m]: 0 to 1, -1 where no depth."""
+    out = np.full(z.shape, -1.0)
+    for t in range(z.shape[0]):
+        for k in range(z.shape[1]):
+            off, _, farthest = nearest_reading(depth[t], uv[t, k, 0], uv[t, k, 1], z[t, k])
+            if farthest > 0:
+                color = color_cost(feature[t], uv[t, k, 0], uv[t, k, 1], point_features[k])
+                out[t, k] = 0.7 * color + 0.3 * min(off / tolerance(z[t, k]), 1.0)
+    return out
+
+
+@numba.njit(cache=True)
+def inlier_shares(R, t, start, path, known, within):
+    """Share of a point's known frames (N,) in which a motion R (F, 3, 3), t (F, 3) carries it along its path.
+
+    start (N, 3), path (F, N, 3), known (F, N), within (F, N) [m].
+    """
+    frames, n = known.shape
+    out = np.zeros(n)
+    for k in range(n):
+        p, fits, total = start[k], 0, 0
+        for f in range(frames):
+            if not known[f, k]:
+                continue
+            total += 1
+            off = 0.0
+            for a in range(3):
+                x = R[f, a, 0] * p[0] + R[f, a, 1] * p[1] + R[f, a, 2] * p[2] + t[f, a] - path[f, k, a]
+                off += x * x
+            fits += off < within[f, k] ** 2
+        out[k] = fits / max(total, 1)
+    return out

@@ -1,0 +1,100 @@
+"""Which body a pixel belongs to: the one that best explains its depth and color over all frames."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64, Num
+
+from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
+from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
+
+_FRAMES = 32
+"""Frames that are looked at."""
+_MOTION_PENALTY = 0.08
+"""What a motion costs for the share of frames in which it really moves the point: prefers stillness."""
+_UNKNOWN_COST = 0.9
+_REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE = 3, 0.010, 0.35, 2.0
+"""Of the mean over neighbors: cells to either side, and the widths in depth [m], color and cells."""
+
+
+@dataclass(frozen=True, slots=True)
+class BodyAssignment:
+    """The cost of every motion in every cell; motion 0 is stillness."""
+
+    raw: Float32[np.ndarray, "B h w"]
+    cost: Float32[np.ndarray, "B h w"]
+    """Averaged over neighbors that look alike; infinite where the cell has no depth."""
+
+    @property
+    def best_motion(self) -> Int64[np.ndarray, "h w"]:
+        """The best motion of every cell, -1 where there is no depth."""
+        return np.where(np.isfinite(self.cost[0]), self.cost.argmin(0), -1)
+
+    def select(self, motions: Sequence[int]) -> "BodyAssignment":
+        """The same with some of the motions only."""
+        return BodyAssignment(self.raw[list(motions)], self.cost[list(motions)])
+
+
+def motion_costs(
+    pictures: ClipFeatures,
+    motions: Sequence[RigidMotion],
+    uv: Num[np.ndarray, "n 2"],
+    xyz_cam: Float[np.ndarray, "n 3"],
+    motion_penalty: float = _MOTION_PENALTY,
+) -> Float32[np.ndarray, "B n"]:
+    """How badly each motion explains points of the first frame, in the mean over the frames.
+
+    Args:
+        pictures: The clip.
+        motions: B of them.
+        uv: The points' pixels.
+        xyz_cam: Their positions [m].
+        motion_penalty: Cost of moving a point by more than 1 cm in all frames.
+    """
+    frames = np.unique(np.linspace(1, len(pictures) - 1, min(len(pictures) - 1, _FRAMES)).round().astype(int))
+    features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
+    R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
+    cost, moved = _costs.motion_costs(xyz_cam, features, frames, R, t, pictures.depth, pictures.feature, pictures.K)
+    return cost + motion_penalty * moved
+
+
+def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMotion]) -> BodyAssignment:
+    """Costs of stillness and of some motions, in all cells whose motion is undecided."""
+    every = [RigidMotion.identity(len(pictures)), *motions]
+    raw = np.full((len(every), *grid.valid.shape), _UNKNOWN_COST, np.float32)
+    raw[0] = 0
+    uv = grid.pixels(grid.undecided)
+    xyz = pictures.unproject(uv.astype(float), grid.depth[grid.undecided].astype(float))
+    raw[:, grid.undecided] = motion_costs(pictures, every, uv, xyz)
+    feature = pictures.feature[0, ::STEP, ::STEP]
+    cost = _surfaces.aggregate(
+        raw, grid.undecided, grid.valid, grid.depth, feature, _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE
+    )
+    return BodyAssignment(raw, cost)
+
+
+def select_needed(assignment: BodyAssignment, margin: float = 0.10) -> list[int]:
+    """The motions worth having: dropped, one by one, is what costs its cells little to do without.
+
+    Args:
+        assignment: What every motion costs.
+        margin: How much more its cells must cost without a motion, in the mean, for it to be kept.
+
+    Returns:
+        Indices of the motions to keep, stillness and at least one more among them, where there is one.
+    """
+    kept = list(range(len(assignment.cost)))
+    while len(kept) > 2:
+        cost = assignment.cost[kept]
+        valid = np.isfinite(cost[0])
+        best, second = np.partition(cost[:, valid], 1, axis=0)[:2]
+        owner, gain = cost[:, valid].argmin(0), second - best
+        worth = [gain[owner == k].mean() if (owner == k).any() else 0.0 for k in range(1, len(kept))]
+        least = int(np.argmin(worth))
+        if worth[least] > margin:
+            break
+        kept.pop(1 + least)
+    return kept

@@ -1,0 +1,129 @@
+"""What of the first frame stays, what moves away, and what cannot be told: by the depth of all frames."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int32
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
+
+STEP = 2
+"""Every how many pixels, both ways, the first frame is labeled."""
+_LATE_SHARE = 0.85
+"""What is static must be there in the frames after this share of the clip, too."""
+_MIN_STATIC_SHARE = 0.25
+"""A camera that stands still sees at least this share of the scene stay."""
+_UNDECIDED_BAND = 6
+"""Cells around what moves in which the motion is decided by cost, not by having stayed."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionGrid:
+    """The cells of the first frame that get a label: every second pixel of every second row."""
+
+    v: Int32[np.ndarray, "h w"]
+    u: Int32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]
+    """At the first frame [m]."""
+    valid: Bool[np.ndarray, "h w"]
+    """Has depth."""
+    edge: Bool[np.ndarray, "h w"]
+    """Lies at a depth edge."""
+    moved: Bool[np.ndarray, "h w"]
+    """The camera later looks through where it was."""
+    static: Bool[np.ndarray, "h w"]
+    """Looks the same and is as deep to the end."""
+    undecided: Bool[np.ndarray, "h w"]
+    """Not static, or near something that moved: its motion is to be found."""
+
+    def pixels(self, mask: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "n 2"]:
+        """(u, v) of the cells of a mask."""
+        return np.stack([self.u[mask], self.v[mask]], 1)
+
+    def components(self, mask: Bool[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
+        """The connected parts of a mask, the largest first; depth jumps divide them."""
+        cell = np.arange(mask.size).reshape(mask.shape)
+        joins = []
+        for near, far in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
+            same = np.abs(self.depth[near] - self.depth[far]) < 0.03 * np.maximum(1, self.depth[near])
+            both = mask[near] & mask[far] & same
+            joins.append(np.stack([cell[near][both], cell[far][both]]))
+        a, b = np.concatenate(joins, 1)
+        label = connected_components(coo_matrix((np.ones(len(a)), (a, b)), (mask.size, mask.size)), False)[1]
+        label = np.where(mask, label.reshape(mask.shape), -1)
+        names, counts = np.unique(label[mask], return_counts=True)
+        return [label == name for name in names[np.argsort(-counts, kind="stable")]]
+
+
+def segment_motion(pictures: ClipFeatures) -> MotionGrid:
+    """Sort the cells of the first frame into static, moved and unknown, by what every later frame shows there.
+
+    Free space seen where a surface was means that it moved; something in front of it only hides it. Where less than
+    a quarter of the scene stays, the camera moves, and nothing is static.
+    """
+    height, width = pictures.depth.shape[1:]
+    v, u = (x.astype(np.int32) for x in np.mgrid[0:height:STEP, 0:width:STEP])
+    z = pictures.depth[0, ::STEP, ::STEP]
+    through, near, unlike, late = _count_evidence(pictures, z)
+    valid, steps = z > 0, len(pictures) - 1
+    moved = valid & (through >= max(2, 0.03 * len(pictures)))
+    moved &= cv2.boxFilter(moved.astype(np.float32), -1, (3, 3), normalize=False) >= 3
+    looks_different = (unlike / np.maximum(near, 1) > 64) & _textured(pictures)[::STEP, ::STEP]
+    static = valid & ~moved & (near >= 0.25 * steps) & (late >= 0.5 * (1 - _LATE_SHARE) * steps) & ~looks_different
+    if static.sum() < _MIN_STATIC_SHARE * valid.sum():
+        static[:] = False  # the camera moves: what looks the same does so by chance
+    undecided = (valid & ~static) | _grow(moved, z, valid)
+    return MotionGrid(v, u, z, valid, _edges(pictures.depth[0])[::STEP, ::STEP], moved, static, undecided)
+
+
+def _count_evidence(pictures: ClipFeatures, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """In how many later frames the camera looks through each cell of depth z (h, w) [m], in how many the surface is
+    there still, how much it looks unlike the first frame in those together, and in how many of the last it is."""
+    within = 0.010 * np.maximum(1, z * z)
+    through, near, unlike, late = np.zeros((4, *z.shape))
+    for t in range(1, len(pictures)):
+        low, high = (x[::STEP, ::STEP] for x in _extremes(pictures.depth[t]))
+        d = pictures.depth[t, ::STEP, ::STEP]
+        seen_through = (high > 0) & (low > z + within)
+        there = (high > 0) & ~seen_through
+        there &= (np.abs(d - z) < within) | (np.abs(low - z) < within) | (np.abs(high - z) < within)
+        through += seen_through
+        near += there
+        late += there & (t >= _LATE_SHARE * len(pictures))
+        change = cv2.blur(cv2.absdiff(pictures.feature[t, :, :, 0], pictures.feature[0, :, :, 0]), (5, 5))
+        unlike += there * change[::STEP, ::STEP]
+    return through, near, unlike, late
+
+
+def _edges(depth: np.ndarray) -> np.ndarray:
+    """Which pixels lie at a depth edge."""
+    nearest, farthest = _extremes(depth)
+    return (farthest - nearest) > 0.02 * np.maximum(depth, 0.1) + 0.01
+
+
+def _extremes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest reading in the 3x3 pixels around each; 99 and 0 where there is none."""
+    k = np.ones((3, 3), np.uint8)
+    return cv2.erode(np.where(depth > 0, depth, np.float32(99)), k), cv2.dilate(depth, k)
+
+
+def _textured(pictures: ClipFeatures) -> np.ndarray:
+    """Where the first frame has texture to recognize."""
+    gray = pictures.lightness(0)
+    mean = cv2.blur(gray, (9, 9))
+    return cv2.blur(gray * gray, (9, 9)) - mean * mean > 64
+
+
+def _grow(mask: np.ndarray, z: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The mask and the cells within reach of it over unbroken surface."""
+    for _ in range(_UNDECIDED_BAND):
+        grown = mask.copy()
+        for near, far in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
+            same = np.abs(z[near] - z[far]) < 0.02 * np.maximum(1, z[far])
+            grown[near] |= mask[far] & same
+            grown[far] |= mask[near] & same
+        mask = grown & valid
+    return mask

@@ -1,0 +1,249 @@
+"""Poses of rigid bodies, frame by frame. What is aligned is always their first frame, so nothing drifts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Int32
+
+from flowlab.tracking.trackers.rigid_bodies import _costs, _gauss_newton
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
+from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, fit_rigid, nearest_rotation
+
+_POINTS_PER_BODY = 400
+"""Points a body is tracked by."""
+_ITERATIONS = 6
+"""Of Gauss-Newton, for every frame."""
+_HIGH_ENERGY, _ENERGY_RISE = 0.4, 0.05
+"""An energy above this, or this much above the last frame's, calls for a wider search."""
+_MAX_STEP_M, _STEP_PENALTY = 0.15, 10.0
+"""Nothing moves farther than this from one frame to the next [m]."""
+_LOST, _GOOD = 0.4, 0.6
+"""Energies above which a body is lost, and below which another may hold it."""
+_SHIFTS = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.0)
+_FAN_PX = np.array([(x, y, 0.0) for y in _SHIFTS for x in _SHIFTS])
+"""Shifts in the picture [px] that a wider search tries."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigidBody:
+    """Pixels of the first frame that move as one."""
+
+    pixels: Int32[np.ndarray, "n 2"]
+    motion: RigidMotion
+    """How they move; before they have been tracked, a guess."""
+    guessed: Bool[np.ndarray, "T"]
+    """Frames in which the guess is worth a try."""
+    region: Bool[np.ndarray, "h w"] | None = None
+    """Cells of the grid it was last fitted to."""
+
+
+class _BodyBatch:
+    """Some bodies, as arrays that compiled code takes; B bodies of n points."""
+
+    def __init__(self, pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator) -> None:
+        self.pictures = pictures
+        chosen = [b.pixels[_sample(len(b.pixels), rng)] for b in bodies]
+        uv = np.stack(chosen)
+        z = pictures.smooth[0, uv[..., 1], uv[..., 0]].astype(float)
+        self.points = pictures.unproject(uv.astype(float), z)
+        flat = uv.reshape(-1, 2).astype(np.float32)
+        self.features = _costs.features_at(pictures.feature[0], flat).reshape(*uv.shape[:2], 4)
+        self.lightness = self.features[..., 1].astype(float)
+        self.center = self.points.mean(1)
+        self.last_center = self.center
+        """Where the bodies' centers (B, 3) [m] were in the frame before the one looked at."""
+
+    def energies(
+        self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Energy and seen share (B', C) of candidate poses (B', C, 3, 3), (B', C, 3) in frame t."""
+        p = self.pictures
+        energy, seen = _costs.energies(self.points[of], self.features[of], R, s, p.depth[t], p.feature[t], p.K, every)
+        leap = np.linalg.norm(_rotate(R, self.center[of][:, None]) + s - self.last_center[of][:, None], axis=-1)
+        return energy + _STEP_PENALTY * (leap > _MAX_STEP_M), seen
+
+    def align(
+        self, t: int, R: np.ndarray, s: np.ndarray, lightness: np.ndarray, of: np.ndarray | slice = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (B', 3, 3), (B', 3) refined on frame t, whose lightness is given."""
+        p = self.pictures
+        R, s = _gauss_newton.align(
+            self.points[of], self.lightness[of], R, s, lightness, p.smooth[t], p.normal[t], p.K, _ITERATIONS
+        )
+        return nearest_rotation(R), s
+
+
+def _sample(n: int, rng: np.random.Generator) -> np.ndarray:
+    if n == _POINTS_PER_BODY:
+        return np.arange(n)
+    return rng.choice(n, _POINTS_PER_BODY, replace=n < _POINTS_PER_BODY)
+
+
+def track_poses(pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator) -> list[RigidBody]:
+    """Find the motions of some bodies, all of them together, frame by frame.
+
+    Args:
+        pictures: The clip.
+        bodies: Which pixels of the first frame move as one, and guesses of how.
+        rng: Chooses the pixels by which a body is tracked.
+
+    Returns:
+        The same bodies in the same order, with the motions found.
+    """
+    if not bodies:
+        return []
+    batch, frames, count = _BodyBatch(pictures, bodies, rng), len(pictures), len(bodies)
+    R, s = np.tile(np.eye(3), (frames, count, 1, 1)), np.zeros((frames, count, 3))
+    energy = np.zeros(count)
+    seen_R, seen_s = R[0].copy(), s[0].copy()
+    for t in range(1, frames):
+        batch.last_center = _rotate(R[t - 1], batch.center) + s[t - 1]
+        poses = _easy_guesses(bodies, t, R, s, (seen_R, seen_s))
+        best = _BestPoses(*_choose(batch.energies(t, *poses), *poses))
+        hard = np.flatnonzero((best.energy > _HIGH_ENERGY) | (best.energy > energy + _ENERGY_RISE))
+        if len(hard):
+            _search(batch, t, best, hard, R[t - 1], s[t - 1])
+        lightness = pictures.lightness(t)
+        best.try_poses(slice(None), *_evaluate(batch, t, *batch.align(t, best.R, best.s, lightness)), slack=1e-3)
+        _borrow_motions(batch, t, best, R[t - 1], s[t - 1], lightness)
+        R[t], s[t], energy = best.R, best.s, best.energy
+        good = (best.seen > 0.4) & (energy < 0.5)
+        seen_R[good], seen_s[good] = R[t, good], s[t, good]
+    return [replace(b, motion=RigidMotion(R[:, k], s[:, k])) for k, b in enumerate(bodies)]
+
+
+def _easy_guesses(
+    bodies: Sequence[RigidBody], t: int, R: np.ndarray, s: np.ndarray, seen: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses to try in frame t (B, 4, 3, 3) and (B, 4, 3): that of the frame before, that in which the body was last
+    seen well, that to which its last step leads again, and that of its proposal."""
+    before = max(t - 2, 0)
+    R_step = R[t - 1] @ R[before].swapaxes(1, 2)
+    s_step = s[t - 1] - _rotate(R_step, s[before])
+    guess_R = np.stack([b.motion.R[t] if b.guessed[t] else R[t - 1, k] for k, b in enumerate(bodies)])
+    guess_s = np.stack([b.motion.t[t] if b.guessed[t] else s[t - 1, k] for k, b in enumerate(bodies)])
+    return (
+        np.stack([R[t - 1], seen[0], R_step @ R[t - 1], guess_R], 1),
+        np.stack([s[t - 1], seen[1], _rotate(R_step, s[t - 1]) + s_step, guess_s], 1),
+    )
+
+
+@dataclass(slots=True)
+class _BestPoses:
+    """The best poses found so far in a frame, with their energies and seen shares."""
+
+    R: np.ndarray
+    s: np.ndarray
+    energy: np.ndarray
+    seen: np.ndarray
+
+    def try_poses(
+        self, of: np.ndarray | slice, R: np.ndarray, s: np.ndarray, energy: np.ndarray, seen: np.ndarray, slack: float
+    ) -> np.ndarray:
+        """Take poses of the bodies ``of`` where they are better, or worse by no more than ``slack``."""
+        index = np.arange(len(self.energy))[of]
+        better = energy < self.energy[index] + slack
+        take = index[better]
+        self.R[take], self.s[take], self.energy[take], self.seen[take] = (
+            R[better],
+            s[better],
+            energy[better],
+            seen[better],
+        )
+        return take
+
+
+def _rotate(R: np.ndarray, s: np.ndarray) -> np.ndarray:
+    return (R @ s[..., None])[..., 0]
+
+
+def _choose(
+    valued: tuple[np.ndarray, np.ndarray], R: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of each body's candidates the best."""
+    energy, seen = valued
+    k = np.arange(len(energy)), energy.argmin(1)
+    return R[k], s[k], energy[k], seen[k]
+
+
+def _evaluate(
+    batch: _BodyBatch, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    energy, seen = batch.energies(t, R[:, None], s[:, None], of)
+    return R, s, energy[:, 0], seen[:, 0]
+
+
+def _search(
+    batch: _BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
+) -> None:
+    """For bodies that no easy guess explains: optical flow of their own points, and shifts in the picture."""
+    flow_R, flow_s = _by_flow(batch, t, best, hard, last_R, last_s)
+    best.try_poses(hard, *_evaluate(batch, t, flow_R, flow_s, hard), slack=0)
+    depth = _rotate(best.R[hard], batch.center[hard])[:, 2] + best.s[hard, 2]
+    fan = _FAN_PX / batch.pictures.K[0, 0] * depth[:, None, None]
+    R = np.concatenate([np.repeat(x[hard][:, None], len(_FAN_PX), 1) for x in (best.R, last_R)], 1)
+    s = np.concatenate([x[hard][:, None] + fan for x in (best.s, last_s)], 1)
+    found = _choose(batch.energies(t, R, s, hard, every=3), R, s)
+    best.try_poses(hard, *_evaluate(batch, t, found[0], found[1], hard), slack=0)
+
+
+def _by_flow(
+    batch: _BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The poses that optical flow of the points seen in the last frame asks for; the best where it asks for none."""
+    R, s = best.R[hard].copy(), best.s[hard].copy()
+    xyz = batch.points[hard] @ last_R[hard].swapaxes(1, 2) + last_s[hard][:, None]
+    which, point = np.nonzero(_seen_every_third(batch.pictures, t - 1, xyz))
+    if len(which) == 0:
+        return R, s
+    target, ok = _carried_by_flow(batch.pictures, t, xyz[which, point])
+    for k in range(len(hard)):
+        mine = ok & (which == k)
+        if mine.sum() >= 6:
+            weight = np.ones(int(mine.sum()))
+            R[k], s[k] = fit_rigid(batch.points[hard[k], point[mine]], target[mine], weight, 3, scale=0.004)
+    return R, s
+
+
+def _seen_every_third(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> np.ndarray:
+    """Which of the points (B, n, 3) [m] frame t shows, among every third of each body."""
+    height, width = pictures.depth.shape[1:]
+    uv = pictures.project(xyz)
+    j, i = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int).transpose(2, 0, 1)
+    there = (uv >= 0).all(-1) & (uv[..., 0] <= width - 1) & (uv[..., 1] <= height - 1)
+    there &= np.abs(pictures.depth[t, i, j] - xyz[..., 2]) < 0.02
+    there[:, np.arange(there.shape[1]) % 3 > 0] = False
+    return there
+
+
+def _carried_by_flow(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where optical flow takes points (n, 3) [m] of frame t - 1 that it shows, and where that can be believed."""
+    height, width = pictures.depth.shape[1:]
+    uv = pictures.project(xyz)
+    j, i = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int).T
+    q = uv + pictures.flow[t, i, j]
+    ok = (q >= 0).all(1) & (q[:, 0] <= width - 1) & (q[:, 1] <= height - 1)
+    j, i = np.clip(np.rint(q), 0, [width - 1, height - 1]).astype(int).T
+    z = pictures.depth[t, i, j].astype(float)
+    ok &= (z > 0) & (np.abs(z - xyz[:, 2]) < 0.03)
+    return pictures.unproject(q, z), ok
+
+
+def _borrow_motions(
+    batch: _BodyBatch, t: int, best: _BestPoses, last_R: np.ndarray, last_s: np.ndarray, lightness: np.ndarray
+) -> None:
+    """A body that is lost may be held by one that is not: let it try the others' motions since the last frame."""
+    lost = np.flatnonzero((best.energy > _LOST) | (best.seen < 0.35))
+    good = np.flatnonzero((best.energy < _GOOD) & (best.seen > 0.4))
+    if not (len(lost) and len(good)):
+        return
+    R_step = best.R[good] @ last_R[good].swapaxes(1, 2)
+    s_step = best.s[good] - _rotate(R_step, last_s[good])
+    R = R_step[None] @ last_R[lost][:, None]
+    s = _rotate(R_step[None], last_s[lost][:, None]) + s_step
+    found = _choose(batch.energies(t, R, s, lost), R, s)
+    taken = best.try_poses(lost, *found, slack=-0.01)
+    if len(taken):
+        aligned = batch.align(t, best.R[taken], best.s[taken], lightness, taken)
+        best.try_poses(taken, *_evaluate(batch, t, *aligned, taken), slack=0)

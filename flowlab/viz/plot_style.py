@@ -1,0 +1,89 @@
+"""One look for all figures: colors, axes, headings, and how they are written."""
+
+import colorsys
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from flowlab.files import temporary_path
+
+INK, QUIET, ALARM = "#22262c", "#747b85", "#c2263b"
+"""Of text: what is read first, what explains it, what warns."""
+GRID = "#e6e8ec"
+BLUE, ORANGE, GREEN, PINK, PURPLE, GRAY = "#2a6fbb", "#e07b1a", "#2f9e6e", "#b8438a", "#7b5bb8", "#6d737c"
+SERIES = (BLUE, ORANGE, GREEN, PINK, PURPLE, GRAY)
+"""Of lines in one plot, in turn; told apart by people who confuse red with green, too."""
+DPI = 150
+HEADING_PT, TICK_PT, LABEL_PT = 10.5, 8.5, 9.0
+_PAPER_COLORS = {
+    "dp3": ORANGE, "mba": GREEN, "fdp": BLUE, "fdp-m50": "#86b4e3", "fdp-m200": "#173f73", "fdp-object": PURPLE,
+    "fdp-stratified": PINK, "fdp-auxiliary": "#8a7a5c",
+}  # fmt: skip
+_FURTHER = ("#c2453d", "#2a9aa8", "#6b7a2e", "#a05a2c", "#5b6ee0", "#4a4f57")
+_GOLDEN = 0.61803398875
+"""Hues that are this share of the circle apart never come close soon."""
+
+
+def policy_colors(labels: Sequence[str]) -> dict[str, str]:
+    """A color of its own for every policy; those of the paper's tables always have the same."""
+    further = _further_colors()
+    return {label: _PAPER_COLORS.get(label) or next(further) for label in labels}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size [in], which needs no window."""
+    figure = Figure(figsize=(width, height), dpi=DPI)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def set_title(figure: Figure, text: str, *, size: float = 15.0) -> None:
+    """The title in a figure's upper left corner; ``size`` is in points."""
+    width, height = figure.get_size_inches()
+    figure.text(0.15 / width, 1 - 0.32 / height, text, fontsize=size, weight="bold", color=INK, va="center")
+
+
+def set_heading(axes: Axes, text: str) -> None:
+    """Say above a panel what it shows."""
+    axes.set_title(text, loc="left", fontsize=HEADING_PT, color=INK, pad=8)
+
+
+def style_axes(axes: Axes, heading: str, ylabel: str = "") -> None:
+    """A panel's grid, ticks and heading."""
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(length=0, which="both", labelsize=TICK_PT, labelcolor=QUIET)
+    hide_frame(axes)
+    set_heading(axes, heading)
+    axes.set_ylabel(ylabel, color=QUIET, fontsize=LABEL_PT)
+
+
+def hide_frame(axes: Axes) -> None:
+    """Draw no lines around a panel."""
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, the same bytes for the same figure. ``path`` is either absent, as before, or whole."""
+    temporary = temporary_path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        figure.savefig(temporary, format="png", facecolor="white", metadata={"Software": None})
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _further_colors() -> Iterator[str]:
+    """Colors without end, each another."""
+    yield from _FURTHER
+    hue = 0.0
+    while True:
+        hue = (hue + _GOLDEN) % 1
+        red, green, blue = (round(255 * c) for c in colorsys.hls_to_rgb(hue, 0.45, 0.5))
+        yield f"#{red:02x}{green:02x}{blue:02x}"
