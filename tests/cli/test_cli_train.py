@@ -402,3 +402,11 @@ def test_what_was_decoded_is_used_until_the_data_change(tmp_path: Path, capsys: 
     assert [len(run["train"]) for run in runs] == [3, 3, 4]
     assert policy_of(tmp_path / "b")["fingerprint"] != policy_of(tmp_path / "c")["fingerprint"]
     assert leftovers(tmp_path) == []
+
+
+def test_help_lists_the_policies_and_loggers_that_are_installed(capsys: Capture) -> None:
+    code, out, _ = call_cli(capsys, "train", "--help")
+    assert code == 0
+    said = " ".join(out.split())
+    assert "There are: dp3, fdp, mba; or module:Class." in said
+    assert "There are: tensorboard, wandb; or module:Class." in said

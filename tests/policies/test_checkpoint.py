@@ -233,8 +233,8 @@ def test_a_full_disk_costs_no_more_than_the_steps_since(
         code, out, err = call_cli(capsys, "train", tmp_path / "run", "--resume", "--json")
     assert (code, out) == (3, "")
     assert re.fullmatch(
-        rf"flowlab: {tmp_path / 'run'}: cannot be written \(.*File too large.*\); what was saved before is whole\. Make "
-        rf"room, then go on with 'flowlab train {tmp_path / 'run'} --resume'\n",
+        rf"flowlab: {tmp_path / 'run'}: cannot be written \(.*File too large.*\); what was saved before is whole\. "
+        rf"Make room, then go on with 'flowlab train {tmp_path / 'run'} --resume'\n",
         err,
     )
     assert {name: content for name, content in saved_by(tmp_path / "run").items() if name in whole} == whole
