@@ -219,8 +219,8 @@ def test_the_last_of_each_task_are_held_out(
 
 def pictured(seed: int, *, rgb: bool = True) -> Episode:
     e, rng = make_episode(seed), np.random.default_rng(seed)
-    color = rng.integers(0, 256, (len(e), 4, 6, 3), np.uint8)
-    return replace(e, rgb=color if rgb else None, depth=rng.random((len(e), 4, 6), np.float32))
+    color = rng.integers(0, 256, (len(e), 12, 16, 3), np.uint8)
+    return replace(e, rgb=color if rgb else None, depth=rng.random((len(e), 12, 16), np.float32))
 
 
 def test_pictures_are_decoded_when_they_are_wanted(tmp_path: Path) -> None:

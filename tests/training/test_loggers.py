@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from trained_runs import SMALL, make_rolls, train
 
 from flowlab.errors import MissingLibraryError, UsageError
 from flowlab.training.loggers import make_logger
