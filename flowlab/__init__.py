@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from flowlab.evaluation.evaluate import evaluate
     from flowlab.evaluation.results import PolicyResult
     from flowlab.geometry.camera import Camera
+    from flowlab.grading.run import grade
     from flowlab.pipeline.extraction import extract
     from flowlab.pipeline.labeling import label
     from flowlab.pipeline.stage import Rejected, Stage
@@ -49,6 +50,7 @@ _LAZY = {
     "label": "flowlab.pipeline.labeling",
     **dict.fromkeys(("TrainedRun", "train"), "flowlab.training.train"),
     "evaluate": "flowlab.evaluation.evaluate",
+    "grade": "flowlab.grading.run",
     "PolicyResult": "flowlab.evaluation.results",
     "Policy": "flowlab.deployment.policy",
     "Camera": "flowlab.geometry.camera",
@@ -106,6 +108,7 @@ __all__ = [
     "data",
     "evaluate",
     "extract",
+    "grade",
     "label",
     "open_dataset",
     "train",

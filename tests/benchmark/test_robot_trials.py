@@ -39,13 +39,13 @@ def session() -> list[RobotTrial]:
 def test_a_file_is_read_as_it_stands(tmp_path: Path) -> None:
     text = (
         "\ufeffsuccess, trial ,note,task,policy\r\n"
-        'Yes,1,"spilt, but\ncaught",pour,fdp\r\n'
+        'Yes,1,"spilled, but\ncaught",pour,fdp\r\n'
         "\r\n"
         "0,2,,pour, fdp \r\n"
         "TRUE,1,,pour,dp3\r\nfalse,2,,pour,dp3\r\nno,3,,pour,dp3\r\n1,4,,pour,dp3"
     )
     assert read_robot_trials(written(tmp_path, text)) == [
-        RobotTrial("fdp", "pour", "1", True, "spilt, but\ncaught"),
+        RobotTrial("fdp", "pour", "1", True, "spilled, but\ncaught"),
         RobotTrial("fdp", "pour", "2", False),
         RobotTrial("dp3", "pour", "1", True),
         RobotTrial("dp3", "pour", "2", False),

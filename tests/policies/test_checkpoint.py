@@ -233,7 +233,7 @@ def test_a_full_disk_costs_no_more_than_the_steps_since(
         code, out, err = call_cli(capsys, "train", tmp_path / "run", "--resume", "--json")
     assert (code, out) == (3, "")
     assert re.fullmatch(
-        rf"flowlab: {tmp_path / 'run'}: cannot be written \(.*File too large.*\); what was kept before is whole\. Make "
+        rf"flowlab: {tmp_path / 'run'}: cannot be written \(.*File too large.*\); what was saved before is whole\. Make "
         rf"room, then go on with 'flowlab train {tmp_path / 'run'} --resume'\n",
         err,
     )

@@ -35,7 +35,7 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ("fsp: 30", r"recording\.yaml: no key is called 'fsp'; did you mean fps"),
         ("intrinsics: {fx: 1, fy: 1, cx: 0, c_y: 0}", "no key is called 'c_y'; did you mean cy"),
         ("intrinsics: {fx: 1, fy: 1, cx: 0}", r"intrinsics\.cy: Field required"),
-        ("topics: {colour: /a}", "no key is called 'colour'; did you mean color"),
+        ("topics: {colr: /a}", "no key is called 'colr'; did you mean color"),
         ("fps: 0", "fps: .* greater than 0"),
         ("depth_unit_m: millimeter", r"depth_unit_m: .* \(found 'millimeter'\)"),
         ("- fps", "must be a mapping"),
