@@ -2,7 +2,7 @@
 
     python benchmarks/eval.py [RUN] [--episodes 8] [--repeats 3] [--rgb-episodes 1] [--json FILE]
 
-Both run the same trained network on the same layouts: that of RUN, if one is given, and always one that knows nothing
+Both run the same trained network in the same scenes: that of RUN, if one is given, and always one that knows nothing
 and so fails after 200 steps, the dearest case. CPU time of the process, with every library held to one thread; the ways
 take turns. ``benchmarks/README.md`` says what each row means.
 """
@@ -35,10 +35,9 @@ from extract import machine, print_rows
 
 from flowlab.data.batches import ObservationBatch
 from flowlab.deployment.runner import PolicyRunner
-from flowlab.engines.local import LocalEngine
 from flowlab.evaluation import rollout
 from flowlab.evaluation.rollout import MAX_STEPS, SimulatorPool, roll_out
-from flowlab.evaluation.trials import Trial, trials
+from flowlab.evaluation.trials import Trial, list_trials
 from flowlab.geometry.sampling import farthest_points
 from flowlab.perception.observer import ObserverSettings
 from flowlab.pipeline.extraction import extract
@@ -56,9 +55,8 @@ LAST_LOOKED_AT = 2
 ABOVE_TABLE_M = 1e-3
 """The table's top is at 0; flowlab's clouds leave it out by what owns the pixel, here its height must do."""
 PARTS: dict[str, tuple[Any, str]] = {
-    "plans": (PolicyNetwork, "plan"),
     "pictures": (EpisodeRecorder, "frame"),
-    "clouds": (PolicyRunner, "see"),
+    "clouds": (PolicyRunner, "observe"),
     "physics": (Simulation, "step"),
     "resets": (TaskSimulator, "begin"),
     "flow errors": (rollout, "flow_error"),
@@ -100,18 +98,18 @@ class Dp3Runner(dp3_steps.Extractor):
             self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
 
     def try_all(self, scene_seeds: Sequence[int], max_steps: int = MAX_STEPS) -> Tried:
-        """Try these layouts, one after the other."""
+        """Try these scenes, one after the other."""
         begin = time.process_time()
-        needed = [self._try(layout, max_steps) for layout in scene_seeds]
+        needed = [self._try(scene_seed, max_steps) for scene_seed in scene_seeds]
         spent = time.process_time() - begin
         steps = (max_steps,) * len(scene_seeds)
         return Tried(spent, steps, tuple(n or max_steps for n in needed), sum(n is not None for n in needed))
 
-    def _try(self, layout: int, max_steps: int) -> int | None:
-        """Try a layout; the steps at the end of the first plan that was seen to succeed."""
+    def _try(self, scene_seed: int, max_steps: int) -> int | None:
+        """Try a scene; the steps at the end of the first plan that was seen to succeed."""
         s = self.network.spec.settings
-        reset(self.env, layout)
-        noise = torch.Generator().manual_seed(layout)
+        reset(self.env, scene_seed)
+        noise = torch.Generator().manual_seed(scene_seed)
         first = self._look()
         seen = deque([first] * s.n_obs_steps, maxlen=s.n_obs_steps)
         queries = np.zeros((0, 3), np.float32)
@@ -137,7 +135,9 @@ class Dp3Runner(dp3_steps.Extractor):
             super()._color()  # the image observation
         cloud = self._cloud()
         points = dp3_steps.sample(self._known_to_network(cloud[:, :3]) if self.in_world else cloud)
-        wanted = self.network.spec.settings.encoder.points
+        cloud_needs = self.network.needs.point_cloud
+        assert cloud_needs is not None
+        wanted = cloud_needs.points
         if wanted < len(points):
             points = points[farthest_points(points, wanted)]
         d = self.env.data
@@ -172,9 +172,9 @@ class Bench:
 
     def __init__(self, loaded: LoadedPolicy, episodes: int, shaded_episodes: int) -> None:
         self.policy, self.task = loaded.policy, loaded.trained.policy.tasks[0]
-        self.trials = trials([self.task], [0], episodes)
+        self.trials = list_trials([self.task], [0], episodes)
         scene = SceneSettings.model_validate(loaded.trained.scene).model_copy(update={"rgb": False})
-        self.stage = SimulatorPool(self.task, scene)
+        self.simulators = SimulatorPool(self.task, scene)
         self.shaded = Dp3Runner(self.policy, self.task, scene, depth_only=False)
         self.depth = Dp3Runner(self.policy, self.task, scene, depth_only=True)
         scene_seeds = [t.scene_seed for t in self.trials]
@@ -206,7 +206,7 @@ class Bench:
         """CPU seconds per episode of each part of ours; apart from the measurement, since clocks cost time too."""
         spent: dict[str, float] = {}
         with ExitStack() as clocks:
-            for part, (owner, name) in PARTS.items():
+            for part, (owner, name) in {"plans": (type(self.policy), "plan"), **PARTS}.items():
                 clocks.enter_context(clocked(owner, name, part, spent))
             whole = self._ours(self.trials).cpu_s
         spent["the rest"] = whole - sum(spent.values())
@@ -214,10 +214,10 @@ class Bench:
 
     def _ours(self, wanted: Sequence[Trial], max_steps: int = MAX_STEPS) -> Tried:
         begin = time.process_time()
-        attempts = list(roll_out(self.policy, self.stage, wanted, max_steps=max_steps))
+        episodes = list(roll_out(self.policy, self.simulators, wanted, max_steps=max_steps))
         spent = time.process_time() - begin
-        steps = tuple(len(a.rollout) for a in attempts)
-        return Tried(spent, steps, steps, sum(a.outcome.success_dp3 for a in attempts))
+        steps = tuple(len(a.rollout) for a in episodes)
+        return Tried(spent, steps, steps, sum(a.result.success_dp3 for a in episodes))
 
 
 @contextmanager
@@ -265,9 +265,9 @@ def summary(found: dict[str, list[Tried]]) -> list[dict[str, Any]]:
 
 
 def untrained(folder: Path) -> LoadedPolicy:
-    """A policy for push after a single step; after fifty, it would solve some layouts."""
+    """A policy for push after a single step; after fifty, it would solve some scene_seeds."""
     recipe = load_recipe("metaworld", ["episodes=3"])
-    extract(recipe, ("push",), folder / "data", start_engine=partial(LocalEngine, workers=1))
+    extract(["push"], folder / "data", recipe=recipe, workers=1)
     settings = load_settings("fast", "fdp", ["run.minutes=null", "run.steps=1", "data.held_out=0"])
     run(prepare_run(folder / "data", folder / "run", settings, ComputeSettings(device="cpu")), lambda _: None)
     return load_policy(folder / "run")

@@ -13,7 +13,6 @@ import json
 import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ import torch
 from simple_dp3 import Ema, SimpleDP3, make_batch, make_optimizer
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.engines.local import LocalEngine
-from flowlab.evaluation.rollout import roll_out
+from flowlab.evaluation.rollout import SimulatorPool, roll_out
+from flowlab.evaluation.trials import list_trials
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.policies.settings import load_settings
@@ -72,7 +71,7 @@ def make_data(task: str, folder: Path) -> Path:
     """Ten demonstrations of a task."""
     data = folder / task
     recipe = load_recipe("metaworld", ["episodes=10"])
-    extract(recipe, (task,), data, start_engine=partial(LocalEngine, workers=1))
+    extract([task], data, recipe=recipe, workers=1)
     return data
 
 
@@ -156,7 +155,7 @@ def interleaved(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str
 def outcome(
     task: str, policy: str, minutes: float, episodes: int, overrides: tuple[str, ...], folder: Path
 ) -> dict[str, Any]:
-    """Success of a policy trained for so many CPU minutes, on layouts it has not seen."""
+    """Success of a policy trained for so many CPU minutes, on scenes it has not seen."""
     data = folder / task if (folder / task).exists() else make_data(task, folder)
     settings = load_settings("fast", policy, [f"run.minutes={minutes}", "data.held_out=0", *overrides])
     out = Path(tempfile.mkdtemp(dir=folder)) / "run"
@@ -164,11 +163,11 @@ def outcome(
     trainer = prepare_run(data, out, settings, ComputeSettings(device="cpu", precision="auto"))
     run(trainer, lambda _: None)
     spent = (time.process_time() - begin) / 60
-    stage = Stage(task, SceneSettings())
+    simulators = SimulatorPool(task, SceneSettings())
     begin = time.process_time()
-    outcomes = [a.outcome for a in roll_out(trainer.average.policy, stage, trials([task], [0], episodes))]
+    results = [a.result for a in roll_out(trainer.average.policy, simulators, list_trials([task], [0], episodes))]
     each = (time.process_time() - begin) / episodes
-    solved = sum(o.success for o in outcomes)
+    solved = sum(r.success for r in results)
     print(
         f"{task:<12} {policy:<4} {solved} of {episodes} solved, after {spent:.1f} CPU minutes, {trainer.step} steps, "
         f"{trainer.processes.description}; {each:.2f} CPU s per episode",

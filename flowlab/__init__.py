@@ -8,25 +8,122 @@ from flowlab.version import __version__
 if TYPE_CHECKING:
     from flowlab import data
     from flowlab.deployment.policy import Policy
+    from flowlab.errors import (
+        DataError,
+        FlowlabError,
+        MissingFileError,
+        MissingLibraryError,
+        RecordError,
+        UnfinishedError,
+        UsageError,
+    )
     from flowlab.evaluation.evaluate import evaluate
+    from flowlab.evaluation.results import PolicyResult
+    from flowlab.geometry.camera import Camera
+    from flowlab.grading.run import grade
+    from flowlab.pipeline.extraction import extract
+    from flowlab.pipeline.labeling import label
+    from flowlab.pipeline.stage import Rejected, Stage
+    from flowlab.provenance import Channels, Provenance
+    from flowlab.records import (
+        Clip,
+        Cloud,
+        Demonstration,
+        Entity,
+        Episode,
+        FlowPrediction,
+        Frame,
+        Observation,
+        PositionSource,
+        Quality,
+        Queries,
+        Role,
+        Tracks2D,
+        Tracks3D,
+    )
+    from flowlab.storage.dataset import Dataset, open_dataset
     from flowlab.training.train import TrainedRun, train
 
-__all__ = ["Policy", "TrainedRun", "__version__", "data", "evaluate", "train"]
-
 _LAZY = {
-    "Policy": "flowlab.deployment.policy",
-    "TrainedRun": "flowlab.training.train",
-    "data": "flowlab",
+    **dict.fromkeys(("Dataset", "open_dataset"), "flowlab.storage.dataset"),
+    "extract": "flowlab.pipeline.extraction",
+    "label": "flowlab.pipeline.labeling",
+    **dict.fromkeys(("TrainedRun", "train"), "flowlab.training.train"),
     "evaluate": "flowlab.evaluation.evaluate",
-    "train": "flowlab.training.train",
-}
+    "grade": "flowlab.grading.run",
+    "PolicyResult": "flowlab.evaluation.results",
+    "Policy": "flowlab.deployment.policy",
+    "Camera": "flowlab.geometry.camera",
+    **dict.fromkeys(
+        (
+            "Clip", "Cloud", "Demonstration", "Entity", "Episode", "FlowPrediction", "Frame", "Observation",
+            "PositionSource", "Quality", "Queries", "Role", "Tracks2D", "Tracks3D",
+        ),
+        "flowlab.records",
+    ),
+    **dict.fromkeys(("Channels", "Provenance"), "flowlab.provenance"),
+    **dict.fromkeys(("Rejected", "Stage"), "flowlab.pipeline.stage"),
+    **dict.fromkeys(
+        (
+            "DataError", "FlowlabError", "MissingFileError", "MissingLibraryError", "RecordError", "UnfinishedError",
+            "UsageError",
+        ),
+        "flowlab.errors",
+    ),
+}  # fmt: skip
 """Where each public name lives: imported only when it is asked for, so that ``import flowlab`` is instant."""
+
+__all__ = [
+    "Camera",
+    "Channels",
+    "Clip",
+    "Cloud",
+    "DataError",
+    "Dataset",
+    "Demonstration",
+    "Entity",
+    "Episode",
+    "FlowPrediction",
+    "FlowlabError",
+    "Frame",
+    "MissingFileError",
+    "MissingLibraryError",
+    "Observation",
+    "Policy",
+    "PolicyResult",
+    "PositionSource",
+    "Provenance",
+    "Quality",
+    "Queries",
+    "RecordError",
+    "Rejected",
+    "Role",
+    "Stage",
+    "Tracks2D",
+    "Tracks3D",
+    "TrainedRun",
+    "UnfinishedError",
+    "UsageError",
+    "__version__",
+    "data",
+    "evaluate",
+    "extract",
+    "grade",
+    "label",
+    "open_dataset",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for."""
+    if name == "data":
+        return import_module("flowlab.data")
     if name in _LAZY:
-        if _LAZY[name] == "flowlab":
-            return import_module(f"flowlab.{name}")
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'flowlab' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """Public names, those too that nobody has asked for yet."""
+    return sorted({*globals(), *__all__})

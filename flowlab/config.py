@@ -17,9 +17,9 @@ class SettingsError(UsageError, ValueError):
 
 
 class _OneSentence(ModelMetaclass):
-    """Has a wrong value in ``EncoderSettings(points=0)`` be one sentence; validation from within pydantic is its own."""
+    """Has a wrong value in ``EncoderSettings(points=0)`` be one sentence; pydantic's own validation is left to it."""
 
-    def __call__(cls, *args: Any, **values: Any) -> Any:
+    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
         try:
             return super().__call__(*args, **values)
         except ValidationError as error:

@@ -1,7 +1,6 @@
 """Run a whole experiment: datasets, policies, their evaluations; unit by unit, each done once."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,20 +10,20 @@ from flowlab.benchmark.recipe import ExperimentRecipe, curve_trials, final_trial
 from flowlab.benchmark.results import read_result, unit_path, write_result
 from flowlab.benchmark.units import ExperimentUnit, plan_units, sampling_of
 from flowlab.data.settings import TrainSettings
+from flowlab.engines.base import StartEngine, engine_by_name
 from flowlab.errors import DataError, UnfinishedError
 from flowlab.evaluation.checkpoints import find_checkpoints
 from flowlab.evaluation.evaluate import evaluate_here
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
-from flowlab.pipeline.recipe import load_recipe
 from flowlab.policies.checkpoint import RUN, newest_checkpoint, read_run_config, read_trained, step_of
-from flowlab.registry import ENGINES
 from flowlab.storage.manifest import differences
 from flowlab.training import run
 
 RUNS = "runs"
 """Folder of an experiment that holds its training runs; of a finished unit, none is needed any more."""
+StartUnits = StartEngine[ExperimentUnit, str]
 OnProgress = Callable[[Sequence[PolicyResult], int, int], None]
 """Told results that have just come, how many there are, and how many there will be."""
 
@@ -60,12 +59,10 @@ def run_experiment(
     report = on_progress or (lambda fresh, done, of: None)
     known = {u.name: result for u in units if (result := _known_result(out, u, recipe)) is not None}
     todo = [u for u in units if u.name not in known]
+    start_engine: StartUnits = engine_by_name(engine, workers, [__name__])
+    _extract(recipe, todo, out, engine, workers)
     report(list(known.values()) if todo else [], len(known), len(units))
     if todo:
-        workers = workers or len(os.sched_getaffinity(0))
-        engine_class: Any = ENGINES.load(engine)
-        start_engine = partial(engine_class, workers=workers)
-        _extract(recipe, todo, out, start_engine)
         _run_units(recipe, todo, out, start_engine, known, lambda r: report([r], len(known), len(units)))
     return [known[u.name] for u in units]
 
@@ -88,13 +85,13 @@ def _run_units(
     recipe: ExperimentRecipe,
     todo: Sequence[ExperimentUnit],
     out: Path,
-    start_engine: Callable[..., Any],
+    start_engine: StartUnits,
     known: dict[str, PolicyResult],
     on_result: Callable[[PolicyResult], None],
 ) -> None:
     """Do units, and add their results to those that are known."""
     failures = []
-    with start_engine(partial(run_unit, recipe, out), imports=[__name__]) as engine:
+    with start_engine(partial(run_unit, recipe, out)) as engine:
         for unit in todo:
             engine.submit(unit)
         for _ in todo:
@@ -129,7 +126,7 @@ def _finished(folder: Path) -> bool:
 
 
 def _extract(
-    recipe: ExperimentRecipe, todo: Sequence[ExperimentUnit], out: Path, start_engine: Callable[..., Any]
+    recipe: ExperimentRecipe, todo: Sequence[ExperimentUnit], out: Path, engine: str, workers: int | None
 ) -> None:
     """Make the datasets that units need: a moment's work beside training."""
     for folder, unit in {u.dataset: u for u in todo}.items():
@@ -138,7 +135,7 @@ def _extract(
             f"queries.points={recipe.query_points}",
             f"queries.sampling={sampling_of(unit.settings)}",
         ]
-        extract(load_recipe(recipe.recipe, changes), (unit.task,), out / folder, start_engine=start_engine)
+        extract([unit.task], out / folder, recipe=recipe.recipe, settings=changes, engine=engine, workers=workers)
 
 
 def _known_result(out: Path, unit: ExperimentUnit, recipe: ExperimentRecipe) -> PolicyResult | None:

@@ -1,11 +1,11 @@
 """The units of an experiment: each one policy on one task, with all its settings."""
 
-import os
 from collections import Counter
 
 from flowlab.benchmark.recipe import ExperimentRecipe, PolicyVariant, expand_tasks, final_trials
 from flowlab.config import Settings
 from flowlab.data.settings import TrainSettings
+from flowlab.engines.base import core_count
 from flowlab.errors import UsageError, unknown_name
 from flowlab.policies.settings import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
@@ -47,7 +47,7 @@ def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
 
 def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) -> str:
     """A sentence on how long training will take."""
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or core_count()
     hours = units * recipe.minutes / 60
     return (
         f"{units} policies, {recipe.minutes:g} minutes of training each: {hours:.1f} hours of one core, "

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from flowlab.pipeline.scheduling import ExtractionProgress
     from flowlab.report.tables import Table as ReportTable
     from flowlab.training.trainer import TrainingProgress
 
@@ -97,3 +98,9 @@ def show_training(bar: ProgressBar, progress: "TrainingProgress") -> None:
     if progress.validation:
         note += f", held out: action {progress.validation['action_l1']:.4f}"
     bar.update(progress.step, progress.steps, "training", note)
+
+
+def show_extraction(bar: ProgressBar, progress: "ExtractionProgress", doing: str, count_rejects: bool = False) -> None:
+    """Show how far a dataset is; of recordings, what was rejected is done, too."""
+    done = progress.accepted + (progress.rejected if count_rejects else 0)
+    bar.update(done, progress.wanted, f"{doing} ({progress.rejected} rejected)" if progress.rejected else doing)

@@ -1,6 +1,6 @@
 """``flowlab info``, ``flowlab validate`` and ``flowlab export``."""
 
-import json
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -14,34 +14,42 @@ from flowlab.errors import DataError
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def info(dataset: Path, as_json: bool) -> None:
     """Say what a dataset holds and how it was made."""
-    from flowlab.cli.reports import folder_size, print_quality, stage_rows, task_rows
-    from flowlab.storage.dataset import Dataset
-    from flowlab.storage.shard import Shard
+    from flowlab.cli.reports import print_quality
+    from flowlab.storage.dataset import open_dataset
+    from flowlab.storage.overview import dataset_overview
 
-    data = Dataset(dataset)
-    tasks, stages = task_rows(data), stage_rows(data)
-    arrays = Shard(dataset / data.refs[0].shard).describe() if data.refs else []
+    data = open_dataset(dataset)
+    overview = dataset_overview(data)
+    tasks, stages = [asdict(t) for t in overview.tasks], [asdict(s) for s in overview.stages]
+    arrays = [
+        {"array": a.path, "dimensions": ", ".join(a.dims), "shape": " x ".join(map(str, a.shape)), "type": a.dtype,
+         "unit": a.unit}
+        for a in overview.arrays
+    ]  # fmt: skip
     about = {
         "dataset": str(dataset),
         "recipe": data.manifest.recipe,
         "flowlab": data.manifest.flowlab,
         "fingerprint": data.fingerprint,
-        "episodes": len(data),
-        "frames": sum(ref.frames for ref in data.refs),
-        "megabytes": round(folder_size(dataset) / 1e6, 2),
+        "episodes": overview.episodes,
+        "frames": overview.frames,
+        "megabytes": overview.megabytes,
         "missing": data.missing,
-        "world_frame": data.manifest.provenance.world_frame,
+        "world_frame": data.provenance.world_frame,
     }
-    manifest = json.loads(data.manifest.model_dump_json())
     if as_json:
+        manifest = data.manifest.model_dump(mode="json")
         recordings = {"recordings": manifest["recordings"]} if manifest["recordings"] else {}
         more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats}
-        print_json({**about, **more, "settings": manifest["settings"], **recordings})
+        print_json(
+            {**about, **more, "settings": manifest["settings"], "provenance": manifest["provenance"]} | recordings
+        )
         return
     for name, value in about.items():
         click.echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
     print_table(["task", "episodes", "asked for", "frames", "rejected"], [list(t.values()) for t in tasks])
-    print_table(["array", "dimensions", "shape of the first shard", "type", "unit"], [list(a.values()) for a in arrays])
+    columns = ["array", "dimensions", "shape of the first shard", "type", "unit"]
+    print_table(columns, [list(a.values()) for a in arrays])
     limits = [
         [name, _numbers(a["min"]), _numbers(a["max"]), _numbers(a["mean"]), _numbers(a["std"])]
         for name, a in data.stats["arrays"].items()

@@ -3,18 +3,19 @@
 from collections.abc import Iterator
 from typing import Any
 
-from flowlab.errors import DataError
-from flowlab.recordings.recording import RecordingDescription, StreamInfo
+from flowlab.pipeline.inspection import InspectedRecording
+from flowlab.recordings.recording import StreamInfo
 
 _SHOWN = 5
 """Bad frames that people are shown of one recording; JSON has all."""
 
 
-def facts_of(found: RecordingDescription | DataError) -> dict[str, Any]:
+def facts_of(one: InspectedRecording) -> dict[str, Any]:
     """What was recognized of a recording, or only its problem."""
-    if isinstance(found, DataError):
-        return {"problem": str(found)}
-    return {
+    found, about = one.description, {"recording": one.recorded.source, "task": one.recorded.task}
+    if found is None:
+        return about | {"problem": one.problem}
+    return about | {
         "reader": found.reader,
         "rows": found.rows,
         "streams": [_stream(s) for s in found.streams],

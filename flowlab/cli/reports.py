@@ -1,71 +1,17 @@
 """What a dataset looks like in a table or in JSON."""
 
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 import click
 
-from flowlab.cli.console import print_table
+from flowlab.cli.console import console, print_json, print_table
+from flowlab.pipeline.units import JobShard
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import StageTally
-from flowlab.storage.shard import Shard
+from flowlab.storage.overview import frame_count, left_out_frames, stage_totals, task_totals
 
 _SHOWN = 10
 """So many bad frames and rejects are printed; the rest is in files."""
-
-
-def folder_size(path: Path) -> int:
-    """Bytes of all files below a folder."""
-    return sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
-
-
-def task_rows(dataset: Dataset) -> list[dict[str, Any]]:
-    """Episodes, frames and rejected seeds of every task."""
-    rows = []
-    for task, wanted in dataset.manifest.requested.items():
-        mine = [r for r in dataset.receipts if r.task == task]
-        rows.append(
-            {
-                "task": task,
-                "episodes": sum(len(r.accepted) for r in mine),
-                "requested": wanted,
-                "frames": sum(sum(r.frames) for r in mine),
-                "rejected": sum(len(r.rejects) for r in mine),
-            }
-        )
-    return rows
-
-
-def stage_rows(dataset: Dataset) -> list[dict[str, Any]]:
-    """Calls, CPU time and rejects of every stage, over all runs."""
-    total: dict[str, StageTally] = {}
-    for receipt in dataset.receipts:
-        for name, tally in receipt.stages.items():
-            total[name] = total.get(name, StageTally()).plus(tally)
-    frames = max(sum(sum(r.frames) for r in dataset.receipts), 1)
-    order = [name for name in dataset.manifest.settings if name in total]
-    return [
-        {
-            "stage": name,
-            "calls": total[name].calls,
-            "cpu_s": round(total[name].cpu_s, 3),
-            "cpu_ms_per_frame": round(total[name].cpu_s / frames * 1e3, 3),
-            "rejects": total[name].rejects,
-        }
-        for name in order
-    ]
-
-
-def bad_frames(dataset: Dataset) -> list[dict[str, Any]]:
-    """The frames of recordings that were left out as bad, by name and reason."""
-    if not dataset.manifest.recordings:
-        return []
-    source = {(r.task, r.seed): r.source for r in dataset.manifest.recordings}
-    return [
-        {"recording": source.get((ref.task, ref.seed), ""), "frame": name, "reason": reason}
-        for ref in dataset.refs
-        for name, reason in Shard(dataset.path / ref.shard).about(ref.position).get("bad_frames", ())
-    ]
 
 
 def extraction_report(dataset: Dataset, seconds: float) -> dict[str, Any]:
@@ -74,17 +20,29 @@ def extraction_report(dataset: Dataset, seconds: float) -> dict[str, Any]:
         "dataset": str(dataset.path),
         "fingerprint": dataset.fingerprint,
         "episodes": len(dataset),
-        "frames": sum(ref.frames for ref in dataset.refs),
+        "frames": frame_count(dataset),
         "missing": dataset.missing,
         "wall_s": round(seconds, 2),
         "peak_worker_memory_mb": round(max((r.peak_memory_mb for r in dataset.receipts), default=0.0)),
-        "tasks": task_rows(dataset),
-        "stages": stage_rows(dataset),
+        "tasks": [asdict(t) for t in task_totals(dataset)],
+        "stages": [asdict(s) for s in stage_totals(dataset)],
         "rejects": [x.model_dump(exclude_defaults=True) for r in dataset.receipts for x in r.rejects],
     }
     if dataset.manifest.recordings:
-        report |= {"quality": dataset.stats.get("quality"), "bad_frames": bad_frames(dataset)}
+        left_out = [asdict(frame) for frame in left_out_frames(dataset)]
+        report |= {"quality": dataset.stats.get("quality"), "bad_frames": left_out}
     return report
+
+
+def finish_extraction(dataset: Dataset, seconds: float, share: JobShard, as_json: bool) -> None:
+    """Print what a command that fills a dataset has come to."""
+    report = extraction_report(dataset, seconds)
+    if as_json:
+        print_json(report)
+        return
+    print_extraction(report)
+    if dataset.missing and share.count > 1:
+        console.print("the rest belongs to the other shards", highlight=False)
 
 
 def print_quality(about: dict[str, Any]) -> None:

@@ -1,23 +1,15 @@
 """``flowlab track-real``."""
 
 import json
-import os
-import sys
 import time
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, console, print_json
+from flowlab.cli.console import ProgressBar, print_json, show_extraction
 from flowlab.errors import DataError, UsageError
-
-if TYPE_CHECKING:
-    from flowlab.pipeline.labeling import CostEstimate
-    from flowlab.pipeline.recipe import Recipe
-    from flowlab.pipeline.units import JobShard
-    from flowlab.storage.recorded import Recorded
 
 
 @click.command("track-real")
@@ -33,6 +25,7 @@ if TYPE_CHECKING:
 @click.option("--recipe", default="real", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
+@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--dry-run", is_flag=True, help="Say what is recognized and how long it would take; write nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
@@ -49,6 +42,7 @@ def track_real(
     recipe: str,
     overrides: tuple[str, ...],
     workers: int | None,
+    engine: str,
     shard: str,
     dry_run: bool,
     as_json: bool,
@@ -62,86 +56,48 @@ def track_real(
 
     An existing dataset with the same settings is continued or extended; recordings that are new get new numbers.
     """
-    sys.path.insert(0, os.getcwd())  # a recipe's own stages may lie beside it
-    from flowlab.pipeline.labeling import find_jobs
-    from flowlab.pipeline.recipe import load_recipe
     from flowlab.pipeline.units import JobShard
 
-    short = {
-        "track.tracker": tracker,
-        "track.chunks.length": chunk,
-        "track.chunks.stride": stride,
-        "track.options.weights": weights,
-        "recording.reader": reader,
-        "recording.calibration": calibration,
-    }
-    changes = [f"{key}={json.dumps(str(v) if isinstance(v, Path) else v)}" for key, v in short.items() if v is not None]
-    chosen = load_recipe(recipe, [*overrides, *changes])
-    share, workers = JobShard.parse(shard), workers or len(os.sched_getaffinity(0))
+    short = {"track.chunks.length": chunk, "track.chunks.stride": stride, "recording.reader": reader}
+    changes = [*overrides, *(f"{key}={json.dumps(value)}" for key, value in short.items() if value is not None)]
+    share = JobShard.parse(shard)
     if out is None and not dry_run:
         raise UsageError("name the folder of the dataset, as in --out data/pour; or look first with --dry-run")
-    recordings = find_jobs(chosen, paths, task)
+    known = {"tracker": tracker, "calibration": calibration, "weights": weights}
     if out is None or dry_run:
-        _dry_run(chosen, recordings, workers, as_json)
-    else:
-        _label(chosen, recordings, out, share, workers, as_json)
-
-
-def _label(
-    recipe: "Recipe", recordings: "tuple[Recorded, ...]", out: Path, share: "JobShard", workers: int, as_json: bool
-) -> None:
-    from flowlab.cli.reports import extraction_report, print_extraction
-    from flowlab.engines.local import LocalEngine
-    from flowlab.pipeline.labeling import label_recordings
-    from flowlab.pipeline.scheduling import ExtractionProgress
+        _dry_run(paths, task, workers, as_json, recipe=recipe, settings=changes, **known)
+        return
+    from flowlab.cli.reports import finish_extraction
+    from flowlab.pipeline.labeling import label
 
     start = time.monotonic()
-    engine = partial(LocalEngine, workers=workers, imports=["flowlab.pipeline.stages.recording"])
     with ProgressBar(quiet=as_json) as bar:
-
-        def show(progress: ExtractionProgress) -> None:
-            note = f"labeling ({progress.rejected} rejected)" if progress.rejected else "labeling"
-            bar.update(progress.accepted + progress.rejected, progress.wanted, note)
-
-        dataset = label_recordings(recipe, recordings, out, start_engine=engine, share=share, report=show)
-    report = extraction_report(dataset, time.monotonic() - start)
-    if as_json:
-        print_json(report)
-        return
-    print_extraction(report)
-    if dataset.missing and share.count > 1:
-        console.print("the rest belongs to the other shards", highlight=False)
+        dataset = label(
+            paths, out, task=task, tracker=tracker, calibration=calibration, weights=weights, recipe=recipe,
+            settings=changes, engine=engine, workers=workers, shard=share,
+            on_progress=lambda progress: show_extraction(bar, progress, "labeling", count_rejects=True),
+        )  # fmt: skip
+    finish_extraction(dataset, time.monotonic() - start, share, as_json)
 
 
-def _dry_run(recipe: "Recipe", recordings: "tuple[Recorded, ...]", workers: int, as_json: bool) -> None:
+def _dry_run(paths: tuple[Path, ...], task: str | None, workers: int | None, as_json: bool, **recipe: Any) -> None:
     """Say what is recognized of every recording, and how long labeling would take."""
     from flowlab.cli.inspected import facts_of, lines_of
-    from flowlab.pipeline.labeling import estimate_cost, inspect_recording
+    from flowlab.pipeline.inspection import estimate_labeling, inspect_recordings
+    from flowlab.pipeline.labeling import find_jobs, labeling_recipe
 
-    rows: list[dict[str, Any]] = []
-    for one in recordings:
-        rows.append({"recording": one.source, "task": one.task} | facts_of(inspect_recording(recipe, one)))
+    chosen = labeling_recipe(**recipe)
+    inspected = []
+    for one in inspect_recordings(chosen, find_jobs(chosen, paths, task)):
+        inspected.append(one)
         if not as_json:
-            click.echo("\n".join(lines_of(rows[-1])))
-    plan = _plan(estimate_cost(recipe, recordings), rows, workers)
+            click.echo("\n".join(lines_of(facts_of(one))))
+    plan = asdict(estimate_labeling(chosen, inspected, workers))
     if as_json:
-        print_json({"recordings": rows} | plan)
+        print_json({"recordings": [facts_of(one) for one in inspected]} | plan)
     else:
         for name, value in plan.items():
             click.echo(f"{name.replace('_', ' '):<18} {value}")
-    problems = sum(row["problem"] is not None for row in rows)
+    problems = sum(one.problem is not None for one in inspected)
     if problems:
-        raise DataError(f"{problems} of {len(rows)} recordings cannot be used as they are; see above")
-
-
-def _plan(cost: "CostEstimate", rows: list[dict[str, Any]], workers: int) -> dict[str, Any]:
-    """How long labeling what can be labeled would take."""
-    frames = sum(row["rows"] for row in rows if row["problem"] is None)
-    seconds = cost.cpu_s_per_frame
-    return {
-        "frames": frames,
-        "cpu_ms_per_frame": None if seconds is None else round(1e3 * seconds, 1),
-        "workers": workers,
-        "estimated_minutes": None if seconds is None else round(frames * seconds / workers / 60, 2),
-        "estimate": cost.basis,
-    }
+        raise DataError(f"{problems} of {len(inspected)} recordings cannot be used as they are; see above")

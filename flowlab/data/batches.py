@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -11,6 +11,9 @@ from torch import Tensor
 
 _OF_FRAMES = ("points", "state", "rgb", "depth")
 """Fields with a row per frame; all others have a row per window."""
+
+
+B = TypeVar("B", bound="ObservationBatch")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +35,7 @@ class ObservationBatch:
     depth: Float[Tensor, "F height width"] | None = None
     """z-depth [m], 0 where there is no reading; None where the policy needs none."""
 
-    def to(self, device: torch.device) -> Self:
+    def to(self: B, device: torch.device) -> B:
         """The same on another device."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         moved: dict[str, Any] = {k: v if v is None else v.to(device, non_blocking=True) for k, v in values.items()}

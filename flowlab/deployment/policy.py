@@ -151,6 +151,8 @@ class Policy:
             workspace = self._observer_settings.crop_for(self.task)
             reason = explain_empty_cloud(frame, workspace) if empty else str(error)
             raise DataError(f"step {self.step}: {reason}") from error
+        except UsageError as error:
+            raise UsageError(f"step {self.step}: {error}") from error
 
     def _plan(self, runner: PolicyRunner) -> Float32[np.ndarray, "T M 3"] | None:
         """Plan, and return the predicted flow from now on."""
@@ -161,7 +163,7 @@ class Policy:
 
     @property
     def _observer_settings(self) -> ObserverSettings:
-        return ObserverSettings.model_validate(self.network.spec.observer)
+        return ObserverSettings.model_validate(self.network.spec.observer or {})
 
     def _checked_state(self, state: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "S"]:
         try:

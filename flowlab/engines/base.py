@@ -1,9 +1,14 @@
-"""What every engine does: run units of work, and hand back what became of them."""
+"""Where work units run: what an engine must do, so that a cluster's can stand in for the processes of this machine."""
 
-from collections.abc import Callable
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from functools import partial
+from typing import Any, Generic, Self, TypeVar
+
+from flowlab.registry import ENGINES
 
 Unit = TypeVar("Unit")
 Receipt = TypeVar("Receipt")
@@ -19,17 +24,64 @@ class UnitResult(Generic[Unit, Receipt]):
     """Traceback, or how the worker died."""
 
 
-class Engine(Protocol[Unit, Receipt]):
-    """Runs units of some kind and hands back outcomes as they come; units never exchange arrays through it."""
+class Engine(ABC, Generic[Unit, Receipt]):
+    """Runs units of some kind and hands back results as they come; units never exchange arrays through it.
 
+    An engine is a context: it begins when that is entered, and stops what still runs when it is left.
+
+    Args:
+        work: Does one unit and returns its receipt. It can be pickled, and so can units and receipts; it keeps what
+            it makes on a disk that all workers and this program share.
+        workers: How many units to run at a time.
+        imports: Modules that a worker will need, to be imported before units come.
+    """
+
+    def __init__(self, work: Callable[[Unit], Receipt], *, workers: int, imports: Sequence[str] = ()) -> None:
+        self.work, self.workers, self.imports = work, workers, tuple(imports)
+
+    def __enter__(self) -> Self:
+        """Begin; the default has nothing to do."""
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        """Stop what still runs; the default has nothing to do."""
+        return
+
+    @abstractmethod
     def submit(self, unit: Unit) -> None:
-        """Start a unit as soon as there is room."""
-        ...
+        """Start a unit as soon as there is room, and return at once."""
 
+    @abstractmethod
     def next_result(self) -> UnitResult[Unit, Receipt]:
-        """Wait for a unit to end. A :class:`FlowlabError` or :class:`OSError` of a worker is raised here."""
-        ...
+        """Wait for a unit to end.
+
+        Raises:
+            FlowlabError: Work raised it, so that going on is useless; :class:`OSError` likewise. Any other error of
+                work is the failure of its unit.
+        """
 
 
 StartEngine = Callable[[Callable[[Unit], Receipt]], AbstractContextManager[Engine[Unit, Receipt]]]
-"""Makes an engine that does units with the given function; leaving the context stops it."""
+"""Makes an engine that does units with the given function."""
+
+
+def core_count() -> int:
+    """Cores that this program may use: as many workers as there are by default."""
+    return len(os.sched_getaffinity(0))
+
+
+def engine_by_name(
+    name: str, workers: int | None = None, imports: Sequence[str] = ()
+) -> Callable[[Callable[[Unit], Receipt]], Engine[Unit, Receipt]]:
+    """What makes an engine of that name, or at that import path.
+
+    Args:
+        name: ``local``, or another that ``flowlab plugins`` lists, or ``module:Class``.
+        workers: How many units to run at a time; None for one for each core of this machine.
+        imports: Modules that a worker will need.
+
+    Raises:
+        UsageError: There is no such engine.
+    """
+    engine: Any = ENGINES.load(name)
+    return partial(engine, workers=workers or core_count(), imports=imports)

@@ -1,4 +1,4 @@
-"""Where work units run. The pool on this machine is one engine; a cluster's would be another."""
+"""The engine that runs work units on this machine."""
 
 import os
 import signal
@@ -8,11 +8,11 @@ import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from multiprocessing import get_context
-from typing import Generic, Self
+from typing import Self
 
 from pebble import ProcessExpired, ProcessPool
 
-from flowlab.engines.base import Receipt, Unit, UnitResult
+from flowlab.engines.base import Engine, Receipt, Unit, UnitResult
 from flowlab.errors import FlowlabError
 from flowlab.files import is_running
 
@@ -27,20 +27,14 @@ _WORKER_ENVIRONMENT = (
 """All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
 
 
-class LocalEngine(Generic[Unit, Receipt]):
+class LocalEngine(Engine[Unit, Receipt]):
     """A pool of processes on this machine.
 
-    A worker that dies loses its own unit only, which is tried once more in a fresh worker. ``imports`` are the modules
-    that they will need.
+    A worker that dies loses its own unit only, which is tried once more in a fresh worker.
     """
 
-    def __init__(
-        self,
-        work: Callable[[Unit], Receipt],
-        workers: int,
-        imports: Sequence[str] = ("flowlab.pipeline.stages.simulation",),
-    ) -> None:
-        self._work, self._workers, self._imports = work, workers, imports
+    def __init__(self, work: Callable[[Unit], Receipt], *, workers: int, imports: Sequence[str] = ()) -> None:
+        super().__init__(work, workers=workers, imports=imports)
         self._tries: dict[Future[Receipt], tuple[Unit, int]] = {}
 
     def __enter__(self) -> Self:
@@ -48,9 +42,9 @@ class LocalEngine(Generic[Unit, Receipt]):
             os.environ.setdefault(name, "1")
         # Workers are forked from a clean process that has imported everything once, and share its memory.
         context = get_context("forkserver")
-        context.set_forkserver_preload(["flowlab.pipeline.worker", *self._imports])
+        context.set_forkserver_preload([*self.imports])
         self._pool = ProcessPool(
-            max_workers=self._workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
+            max_workers=self.workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )
         return self
 
@@ -81,7 +75,7 @@ class LocalEngine(Generic[Unit, Receipt]):
                 return UnitResult(unit, None, "".join(traceback.format_exception(error)))
 
     def _schedule(self, unit: Unit, tries: int) -> None:
-        self._tries[self._pool.schedule(self._work, args=[unit])] = unit, tries
+        self._tries[self._pool.schedule(self.work, args=[unit])] = unit, tries
 
 
 def _start_worker(program: int) -> None:

@@ -1,14 +1,13 @@
 """Evaluate trained policies: which episodes are missing, who tries them, and what came out."""
 
-import os
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from flowlab.config import Settings
+from flowlab.engines.base import StartEngine, core_count, engine_by_name
 from flowlab.errors import UnfinishedError
 from flowlab.evaluation.checkpoints import CheckpointRef, common_tasks, find_checkpoint, find_checkpoints
 from flowlab.evaluation.episode_log import append_result, read_results, repair_tail
@@ -18,7 +17,6 @@ from flowlab.evaluation.training_record import describe_run
 from flowlab.evaluation.trials import Trial, check_unseen, list_trials
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
-from flowlab.registry import ENGINES
 from flowlab.sim.simulation import SceneSettings
 
 _LARGEST_BATCH = 40
@@ -104,12 +102,11 @@ def evaluate_checkpoints(
     """
     for checkpoint in checkpoints:
         check_unseen(trials, checkpoint.trained.scene_seeds, checkpoint.run)
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or core_count()
     batches = [b for c in checkpoints for b in _missing_batches(c, trials, workers * 2, device)]
     batches.sort(key=lambda b: b.trials[0].task)  # a worker keeps the simulations of the last task
     if batches:
-        engine_class: Any = ENGINES.load(engine)
-        start_engine = partial(engine_class, workers=workers, imports=[__name__])
+        start_engine = engine_by_name(engine, workers, [__name__])
         _run_batches(batches, len(checkpoints) * len(trials), start_engine, on_progress)
     return [c.read_evaluation(trials) for c in checkpoints]
 
@@ -139,7 +136,7 @@ def _checkpoints_of(path: Path, n_action_steps: int | None, *, every: bool) -> l
 
 
 def _run_batches(
-    batches: Sequence[EpisodeBatch], total: int, start_engine: Callable[..., Any], on_progress: Progress
+    batches: Sequence[EpisodeBatch], total: int, start_engine: StartEngine[EpisodeBatch, int], on_progress: Progress
 ) -> None:
     done = total - sum(len(b.trials) for b in batches)
     on_progress(done, total)

@@ -1,7 +1,7 @@
 """How well a policy predicted what its own actions did to the scene."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -38,22 +38,16 @@ def flow_error(
     distinct = slice(0, queries.count)
     tracks = rigid_tracks(rollout, queries, RigidFlowSettings())[0][:, distinct].astype(np.float64)
     _, z = rollout.camera.project(tracks)
-    moving, still, last, depth = [], [], [], []
-    for step, flow in predicted:
-        true_world = tracks[step + 1 : step + 1 + n_action_steps]  # the last action's end is not among the poses
-        if len(true_world) == 0:
-            continue
-        true = true_world - tracks[step]
-        distance = np.stack([np.linalg.norm(d, axis=-1) for d in (flow[: len(true), distinct].cumsum(0) - true, true)])
-        moves = (distance[1] > MOVING_M).any(0)
-        moving.append(distance[:, :, moves].reshape(2, -1))
-        depth.append(z[step + 1 : step + 1 + n_action_steps, moves].reshape(-1))
-        last.append(distance[:, -1, moves])
-        still.append(distance[0][:, ~moves].reshape(-1))
-    if not sum(part.size for part in moving):
+    parts = [
+        _errors_of_plan(flow[:n_action_steps, distinct], tracks[step : step + 1 + n_action_steps], z[step + 1 :])
+        for step, flow in predicted
+        if step + 1 < len(tracks)  # the last action's end is not among the poses
+    ]
+    if not sum(part.moving.size for part in parts):
         return None
-    errors = PlanErrors(*(np.concatenate(x, -1) for x in (moving, last, still, depth)))
-    return errors.summarize(rollout.camera)
+    names = [f.name for f in fields(PlanErrors)]
+    together = {name: np.concatenate([getattr(part, name) for part in parts], -1) for name in names}
+    return PlanErrors(**together).summarize(rollout.camera)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,3 +85,19 @@ class PlanErrors:
         rounded = {name: round(float(value), _DIGITS) for name, value in figures.items()}
         counts = {"pairs": self.moving.shape[-1], "ends": self.last.shape[-1], "still_pairs": self.still.size}
         return RolloutFlowError(**counts, **rounded)
+
+
+def _errors_of_plan(
+    flow: Float32[np.ndarray, "K M 3"], tracks_world: Float[np.ndarray, "J M 3"], z: Float[np.ndarray, "L M"]
+) -> PlanErrors:
+    """One plan's flow [m] against where the points truly were, from when it was made to the next; z from one step later
+    on."""
+    true = tracks_world[1:] - tracks_world[0]
+    distance = np.stack([np.linalg.norm(d, axis=-1) for d in (flow[: len(true)].cumsum(0) - true, true)])
+    moves = (distance[1] > MOVING_M).any(0)
+    return PlanErrors(
+        moving=distance[:, :, moves].reshape(2, -1),
+        last=distance[:, -1, moves],
+        still=distance[0][:, ~moves].reshape(-1),
+        depth=z[: len(true), moves].reshape(-1),
+    )

@@ -81,6 +81,14 @@ def roll_out(
     Yields:
         Every episode, in the order in which they end.
     """
+
+    def begin(slot: int, trial: Trial) -> _RunningEpisode:
+        runner = PolicyRunner(policy.spec, trial.task, trial.scene_seed, n_action_steps)
+        recorder = simulators.simulator(slot).begin(trial.scene_seed)
+        episode = _RunningEpisode(trial, recorder, runner, max_steps, render_every_step)
+        episode.observe()
+        return episode
+
     waiting = [deque(t for t in trials if t.episode % BATCH_SLOTS == slot) for slot in range(BATCH_SLOTS)]
     running: dict[int, _RunningEpisode] = {}
     noise = [torch.Generator() for _ in range(BATCH_SLOTS)]
@@ -88,12 +96,8 @@ def roll_out(
     while running or any(waiting):
         for slot in range(BATCH_SLOTS):
             if slot not in running and waiting[slot]:
-                trial = waiting[slot].popleft()
-                runner = PolicyRunner(policy.spec, trial.task, trial.scene_seed, n_action_steps)
-                recorder = simulators.simulator(slot).begin(trial.scene_seed)
-                running[slot] = _RunningEpisode(trial, recorder, runner, max_steps, render_every_step)
-                running[slot].observe()
-                noise[slot] = runner.noise
+                running[slot] = begin(slot, waiting[slot].popleft())
+                noise[slot] = running[slot].runner.noise
         yield from (running.pop(slot).abort() for slot in sorted(running) if running[slot].note)
         if running:
             plan = policy.plan(_observations(running).to(device), noise)

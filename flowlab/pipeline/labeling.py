@@ -1,31 +1,87 @@
-"""Fill a dataset from recordings, or say what that would take."""
+"""Datasets of recordings: their points are followed through the pictures."""
 
+import json
 import os
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from flowlab.engines.base import StartEngine
-from flowlab.errors import DataError, UsageError
-from flowlab.pipeline.extraction import fill
-from flowlab.pipeline.recipe import Recipe
+from flowlab.errors import UsageError
+from flowlab.pipeline.filling import engine_for, fill
+from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler
-from flowlab.pipeline.stage import EpisodeRequest, Rejected
-from flowlab.pipeline.stages.recording import QualityStage, RecordingStage, TrackStage
+from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.recordings.metadata import FILE_NAME, combine, load_metadata
-from flowlab.recordings.recording import Recording, RecordingDescription, RecordingSettings, describe, find_recordings
+from flowlab.recordings.recording import RecordingSettings, find_recordings
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest, Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
-from flowlab.tracking.base import make_tracker
 
-_TRIAL_FRAMES = 33
-"""As many frames are labeled to tell what all will cost."""
+
+def label(
+    paths: Iterable[Path | str] | Path | str,
+    out: Path | str,
+    *,
+    task: str | None = None,
+    tracker: str | None = None,
+    calibration: Path | str | None = None,
+    weights: Path | str | None = None,
+    recipe: str | Recipe = "real",
+    settings: Iterable[str] = (),
+    engine: str = "local",
+    workers: int | None = None,
+    shard: JobShard | str = JobShard(),
+    on_progress: Callable[[ExtractionProgress], None] | None = None,
+) -> Dataset:
+    """Make a dataset of RGB-D recordings with estimated tracks, as ``flowlab track-real`` does.
+
+    Args:
+        paths: Recordings, or folders with recordings below; or one of them.
+        out: Folder of the dataset. One that was made with the same settings is continued or extended.
+        task: Task of all of them; None for what they say themselves, or the name of the folder they are in.
+        tracker: Name of a tracker; None for the recipe's.
+        calibration: YAML file with calibration for all of them.
+        weights: File with the weights of a learned tracker.
+        recipe: Name of a recipe that comes with flowlab, path of a YAML file, or a recipe.
+        settings: Changes of single settings, ``queries.points=200``.
+        engine: Where it is done: the name of an engine.
+        workers: Processes; None for one for each core.
+        shard: The part to do, for jobs that fill one dataset together: ``0/4``.
+        on_progress: Called whenever a recording is done.
+
+    Returns:
+        The dataset, complete but for what other shards do. What was rejected is in ``rejects``.
+
+    Raises:
+        UsageError: A path, a name, a setting or the recipe does not fit.
+        DataError: The folder holds a dataset that was made with other settings.
+        UnfinishedError: Some units failed; the dataset is whole, and the same call does the rest.
+    """
+    chosen = labeling_recipe(recipe, settings, tracker=tracker, calibration=calibration, weights=weights)
+    return label_recordings(
+        chosen,
+        find_jobs(chosen, [Path(paths)] if isinstance(paths, Path | str) else [Path(p) for p in paths], task),
+        Path(out),
+        start_engine=engine_for(chosen, engine, workers),
+        share=JobShard.parse(shard) if isinstance(shard, str) else shard,
+        report=on_progress or (lambda _: None),
+    )
+
+
+def labeling_recipe(
+    recipe: str | Recipe,
+    settings: Iterable[str] = (),
+    *,
+    tracker: str | None = None,
+    calibration: Path | str | None = None,
+    weights: Path | str | None = None,
+) -> Recipe:
+    """The recipe that :func:`label` goes by, given its arguments."""
+    short = {"track.tracker": tracker, "track.options.weights": weights, "recording.calibration": calibration}
+    changes = [f"{key}={json.dumps(str(value))}" for key, value in short.items() if value is not None]
+    return load_recipe(recipe, [*settings, *changes])
 
 
 def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) -> tuple[Recorded, ...]:
@@ -36,7 +92,7 @@ def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) ->
     """
     settings = recording_stage(recipe)
     found = []
-    for path in find_recordings(paths, settings.reader):
+    for path in find_recordings(paths):
         place = Path(os.path.abspath(path))
         name = task or _task_said(place, settings) or place.parent.name
         if not name or "/" in name or name.startswith("."):
@@ -70,7 +126,7 @@ def label_recordings(
 ) -> Dataset:
     """Label recordings into ``folder``; what an earlier run did is kept, but what it could not open is tried again.
 
-    See :func:`flowlab.pipeline.extraction.fill` for what is raised.
+    See :func:`flowlab.pipeline.filling.fill` for what is raised.
     """
     manifest = Manifest(
         recipe=recipe.name,
@@ -95,67 +151,3 @@ def _forget_unopened(folder: Path, seeds: set[int]) -> None:
     for receipt in read_receipts(folder):
         if receipt.rejects and seeds.issuperset(receipt.seeds) and all(x.retry for x in receipt.rejects):
             (folder / "receipts" / f"{receipt.unit}.json").unlink(missing_ok=True)
-
-
-@dataclass(frozen=True, slots=True)
-class CostEstimate:
-    """What labeling costs."""
-
-    cpu_s_per_frame: float | None
-    """None where no recording could be labeled."""
-    basis: str
-    """How that was found, or why not."""
-
-
-def estimate_cost(recipe: Recipe, recordings: Sequence[Recorded]) -> CostEstimate:
-    """Label the first frames of the first recording that can be labeled, and keep nothing."""
-    failure = ""
-    for one in recordings:
-        try:
-            return _forecast(recipe, one)
-        except Rejected as rejected:
-            failure = failure or str(rejected)
-    return CostEstimate(None, f"no recording can be labeled: {failure}")
-
-
-def _forecast(recipe: Recipe, one: Recorded) -> CostEstimate:
-    request = EpisodeRequest(task=one.task, seed=one.seed, source=one.source)
-    start = time.process_time()
-    whole = recording_stage(recipe).process(request)
-    opening = (time.process_time() - start) / len(whole)
-    frames, seconds = min(len(whole), _TRIAL_FRAMES), 0.0
-    for n in (4, frames):  # the first compiles and loads
-        seconds = sum(_seconds(recipe, _beginning(whole, n), len(whole)))
-    return CostEstimate(opening + seconds / frames, f"measured on the first {frames} frames of {one.task}/{one.name}")
-
-
-def _beginning(whole: Recording, n: int) -> Recording:
-    rows = {name: getattr(whole, name)[:n] for name in ("time_s", "state", "action", "success")}
-    return replace(whole, **rows)
-
-
-def _seconds(recipe: Recipe, short: Recording, whole: int) -> Iterator[float]:
-    """CPU time of every stage but the first and the last, as its frames would take it in a recording of ``whole``."""
-    record: Any = short
-    for stage in recipe.stages[1:-1]:
-        start = time.process_time()
-        with suppress(Rejected) if isinstance(stage, QualityStage) else nullcontext():
-            record = stage.process(record)
-        again = _coverage(stage, whole) / _coverage(stage, len(short)) if isinstance(stage, TrackStage) else 1.0
-        yield (time.process_time() - start) * again
-
-
-def _coverage(stage: TrackStage, steps: int) -> float:
-    """How many times a frame is looked at, on average: about once for every chunk that holds it."""
-    if not make_tracker(stage.tracker, stage.options).chunked:
-        return 1.0
-    length, stride = stage.chunks.length, stage.chunks.stride
-    return sum(min(length, steps - start) for start in range(0, steps - 1, stride)) / steps
-
-
-def inspect_recording(recipe: Recipe, recorded: Recorded) -> RecordingDescription | DataError:
-    """What is recognized of a recording, or why nothing is."""
-    try:
-        return describe(Path(recorded.source), recording_stage(recipe))
-    except DataError as error:
-        return error

@@ -58,16 +58,19 @@ class Recipe(Settings):
         return {s["stage"]: {k: v for k, v in s.items() if k != "stage"} for s in values["stages"]}
 
 
-def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
-    """A recipe by file, or by the name of one that comes with flowlab.
+def load_recipe(name: "str | Recipe", overrides: Iterable[str] = ()) -> Recipe:
+    """A recipe by file, by the name of one that comes with flowlab, or one that is there already.
 
     Args:
-        name: Path of a YAML file, or ``metaworld``. The stages that a file names by import path may lie beside it.
+        name: Path of a YAML file, ``metaworld``, or a recipe. The stages that a file names by import path may lie
+            beside it.
         overrides: Changes of single settings, ``key.path=value``.
 
     Raises:
         UsageError: There is no such recipe, or something in it, or in an override, does not fit.
     """
+    if isinstance(name, Recipe):
+        return parse_recipe(name.model_dump_json(), name.name, overrides, name.folder)
     path = Path(name)
     return parse_recipe(read_named("recipe", name), name, overrides, path.parent if path.suffix else None)
 

@@ -36,9 +36,11 @@ _TENSORS = (
 
 def migrate_policy(values: Any) -> Any:
     """The values of a ``policy.json`` in today's format; anything else than one of format 1 is left as it is."""
-    if not isinstance(values, dict) or values.get("format", 1) != 1 or not isinstance(values.get("policy"), dict):
+    if not isinstance(values, dict) or values.get("format", 1) != 1:
         return values
     moved = _renamed(values, {"layouts": "scene_seeds"})
+    if not isinstance(values.get("policy"), dict):
+        return {**moved, "format": FORMAT}  # whoever reads it says what is wrong
     spec = _renamed(values["policy"], _SPEC)
     spec["settings"] = migrate_settings(spec.get("settings"))
     spec["channels"] = _renamed(spec.get("channels"), _CHANNELS)
@@ -54,7 +56,7 @@ def migrate_tensor(name: str) -> str:
     prefix, weight = re.fullmatch(r"(.*[:/])?(.*)", name).groups("")  # type: ignore[union-attr]
     for pattern, replacement in _TENSORS:
         weight = re.sub(pattern, replacement, weight)
-    return prefix + weight
+    return prefix.replace("optimiser:", "optimizer:") + weight
 
 
 def _renamed(values: Any, names: Mapping[str, str]) -> Any:

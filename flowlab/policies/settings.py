@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BeforeValidator, SerializeAsAny, ValidationError
 
-from flowlab.config import explain, merge, override, read_named
+from flowlab.config import Settings, explain, merge, override, read_named
 from flowlab.data.settings import TrainSettings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.registry import POLICIES
@@ -64,7 +64,9 @@ def load_settings(
         UsageError: The policy or the profile does not exist, or a setting is unknown or wrong; the message names it.
     """
     model = settings_class(policy, folder)
-    values = {**_read_profile(profile, policy, ()), "policy": policy}
+    defaults = {n: f.default for n, f in model.model_fields.items() if not f.is_required()}
+    groups = {n: v.model_dump() if isinstance(v, Settings) else v for n, v in defaults.items()}
+    values = {**merge(groups, _read_profile(profile, policy, ())), "policy": policy}
     for text in overrides:
         _check_known(text.partition("=")[0].partition(".")[0], model, policy, prefix="")
         override(values, text, model.model_fields, _EXAMPLE)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, Num, UInt8
 
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
@@ -20,7 +20,7 @@ PLAUSIBLE_M = (0.02, 100.0)
 
 @dataclass(frozen=True, slots=True)
 class FrameProcessor:
-    """Makes the color and the depth of frames."""
+    """Makes the color and the depth of frames from decoded pictures."""
 
     camera: Camera
     """Of what is given out: undistorted, and shrunk."""
@@ -42,7 +42,7 @@ class FrameProcessor:
             picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         return picture
 
-    def depth(self, counts: np.ndarray) -> Float32[np.ndarray, "H W"]:
+    def depth(self, counts: Num[np.ndarray, "Hs Ws"]) -> Float32[np.ndarray, "H W"]:
         """The depth of a frame [m]: never interpolated, so no value lies between a thing and what is behind it."""
         depth = to_meters(counts, self.depth_unit_m)
         if self.registration is not None:
@@ -55,7 +55,7 @@ class FrameProcessor:
         return np.ascontiguousarray(depth)
 
 
-def to_meters(counts: np.ndarray, unit_m: float) -> Float32[np.ndarray, "H W"]:
+def to_meters(counts: Num[np.ndarray, "H W"], unit_m: float) -> Float32[np.ndarray, "H W"]:
     """Depth [m] of a picture's counts; 0 for what is not a positive number."""
     depth = counts.astype(np.float32) * np.float32(unit_m)
     depth[~(np.isfinite(depth) & (depth > 0))] = 0
@@ -73,10 +73,20 @@ def make_frame_processor(
     write_to: str,
     median_counts: float,
 ) -> FrameProcessor:
-    """What turns pictures of these sizes into frames. Raises :class:`DataError` with the lines to write.
+    """What turns the pictures of a recording into frames.
 
-    ``median_counts`` is a typical reading, to tell a wrong depth unit by; ``write_to`` names the file that
-    the user is to write into.
+    Args:
+        path: The recording, for messages.
+        metadata: What is known of its cameras.
+        color: Size of its color pictures.
+        depth: Size of its depth pictures.
+        registered: Whether depth is seen from the color camera; None where nothing says so.
+        max_width: Wider pictures are shrunk by a whole factor [px].
+        write_to: The file that the user is to write into what is missing.
+        median_counts: A typical depth reading, to tell a wrong unit by.
+
+    Raises:
+        DataError: Calibration is missing or cannot be; the message has the lines to write.
     """
     intrinsics = _intrinsics(path, metadata, color, write_to)
     unit = _unit(path, metadata, median_counts, write_to)
@@ -92,7 +102,7 @@ def make_frame_processor(
     return FrameProcessor(shrunk, unit, factor, maps, registration)
 
 
-def shrink_intrinsics(K: np.ndarray, factor: int) -> np.ndarray:
+def shrink_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
     """Intrinsics of a picture whose pixel (i, j) is the mean of ``factor`` x ``factor`` pixels of another.
 
     The center of a block of pixels is ``(factor - 1) / 2`` to the right of the center of its first.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Num, Shaped, UInt8
 
 from flowlab.recordings.base import BadImage, ImageStream
 from flowlab.text import natural_key
@@ -56,13 +56,17 @@ def decode_color(content: bytes) -> UInt8[np.ndarray, "H W 3"]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def decode_depth(content: bytes) -> np.ndarray:
+def decode_depth(content: bytes) -> Num[np.ndarray, "H W"]:
     """Counts (H, W) of an encoded depth picture."""
     return check_depth(_decode(content, cv2.IMREAD_UNCHANGED))
 
 
-def check_depth(counts: np.ndarray) -> np.ndarray:
-    """The same counts (H, W), where they can be depth: one channel of 16 bits or more."""
+def check_depth(counts: Shaped[np.ndarray, "..."]) -> Num[np.ndarray, "H W"]:
+    """The same counts, without an axis of one channel.
+
+    Raises:
+        BadImage: They cannot be depth, which is one channel of 16 bits or more.
+    """
     if counts.ndim == 3 and 1 in (counts.shape[0], counts.shape[-1]):
         counts = counts.reshape(counts.shape[:-1] if counts.shape[-1] == 1 else counts.shape[1:])
     if counts.ndim != 2:

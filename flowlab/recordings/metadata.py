@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import yaml
+from jaxtyping import Num
 from pydantic import AfterValidator, Field, ValidationError
 
 from flowlab.config import Settings
@@ -58,7 +59,7 @@ class Intrinsics(Settings):
         return any(self.distortion)
 
     @classmethod
-    def from_matrix(cls, K: np.ndarray, **others: Any) -> "Intrinsics":
+    def from_matrix(cls, K: Num[np.ndarray, "3 _"], **others: Any) -> "Intrinsics":
         """From a matrix (3, 3) or (3, 4) [px]."""
         K = np.asarray(K, float)
         return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], **others)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numba
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from flowlab.recordings.metadata import Intrinsics
 
@@ -26,7 +26,12 @@ class Registration:
 
     @classmethod
     def make(
-        cls, depth: Intrinsics, size: tuple[int, int], T_color_depth: np.ndarray, K: np.ndarray, color: tuple[int, int]
+        cls,
+        depth: Intrinsics,
+        size: tuple[int, int],
+        T_color_depth: Float[np.ndarray, "4 4"],
+        K: Float[np.ndarray, "3 3"],
+        color: tuple[int, int],
     ) -> "Registration":
         """For pictures of ``size`` (width, height) of the depth camera and ``color`` of the color camera."""
         centers = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1)

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Num
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream
@@ -20,7 +20,7 @@ def load_times(path: Path) -> Float64[np.ndarray, "N"]:
     return check_times(path, time_s[:, 0])
 
 
-def check_times(path: Path, time_s: np.ndarray) -> Float64[np.ndarray, "N"]:
+def check_times(path: Path, time_s: Num[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
     """The same times, where they can be seconds and never fall."""
     step = np.diff(time_s)
     if not np.isfinite(time_s).all() or (step < 0).any():

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.records import Episode, FlowPrediction
-from flowlab.storage.dataset import Dataset, EpisodeRef, RejectRef
+from flowlab.storage.dataset import Dataset, RejectRef
+from flowlab.storage.episodes import EpisodeRef
 
 
 @dataclass(frozen=True, slots=True)

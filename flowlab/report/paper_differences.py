@@ -50,7 +50,7 @@ def _episodes(summary: Summary) -> str:
         return "No episodes were tried."
     seeds = ", ".join(map(str, summary.seeds))
     return (
-        f"Ours are shares of {_span(counts, 'd')} episodes of each task, of the evaluation seeds {seeds}: layouts "
+        f"Ours are shares of {_span(counts, 'd')} episodes of each task, of the evaluation seeds {seeds}: scenes "
         f"from {SCENES_PER_SEED:,} on, none of which was demonstrated, the same for every policy. The paper's are "
         f"means of {MAIN.episodes} episodes of each task by difficulty, and of {QUERY_POINTS.episodes} elsewhere; "
         "hence its two numbers for 100 query points on the hard tasks."

@@ -68,7 +68,7 @@ def robot_trial_tables(trials: Sequence[RobotTrial]) -> list[Table]:
     ]
     tables = [
         Table(
-            "scored trials; Wilson's intervals",
+            "trials on a robot; Wilson's intervals",
             ("task", "policy", "solved", "of", "%", "95 % interval"),
             tuple(counts),
         ),

@@ -11,25 +11,14 @@ from typing import Any
 
 from flowlab.errors import DataError, MissingFileError
 from flowlab.files import locked, remove_leftovers, write_atomically, write_json
+from flowlab.provenance import Provenance
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
+from flowlab.storage.episodes import EpisodeRef, EpisodeSequence
 from flowlab.storage.manifest import MANIFEST, Manifest, Receipt, differences, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.shard import Shard
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeRef:
-    """Where an episode lies in a dataset."""
-
-    task: str
-    seed: int
-    frames: int
-    shard: str
-    """Path below the dataset."""
-    position: int
-    """Index within the shard."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,18 +37,36 @@ class RejectRef:
     """Index within the shard."""
 
 
-class Dataset:
-    """A dataset opened for reading: episodes in order of task and seed."""
+def open_dataset(path: Path | str) -> "Dataset":
+    """Open a dataset for reading.
+
+    Args:
+        path: Its folder; it may still be in the making.
+
+    Returns:
+        The episodes as a sequence: ``len(d)``, ``d[0]``, ``d[-3:]``, ``for episode in d``, ``d.task("push")``.
+
+    Raises:
+        MissingFileError: There is no such folder; a :class:`FileNotFoundError`, too.
+        DataError: The folder holds no dataset, or one that is damaged.
+    """
+    return Dataset(path)
+
+
+class Dataset(EpisodeSequence):
+    """A dataset opened for reading: episodes in order of task and seed, and all that is known of them."""
 
     def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+        self._path = Path(path)
         if not self.path.exists():
             raise MissingFileError(f"{self.path}: there is no such folder")
         self.manifest = Manifest.read(self.path)
         self.receipts = read_receipts(self.path)
 
-    def __len__(self) -> int:
-        return len(self.refs)
+    @property
+    def path(self) -> Path:
+        """Its folder."""
+        return self._path
 
     @cached_property
     def refs(self) -> list[EpisodeRef]:
@@ -73,12 +80,16 @@ class Dataset:
             key=lambda ref: (ref.task, ref.seed),
         )
 
+    @property
+    def provenance(self) -> Provenance:
+        """Where the episodes come from, and what their numbers mean."""
+        return self.manifest.provenance
+
     def episode(self, index: int) -> Episode:
-        """The episode at a position of :attr:`refs`."""
+        """The episode at a position of :attr:`refs`, from 0. Raises :class:`DataError` where there is none."""
         if not 0 <= index < len(self):
             raise DataError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
-        ref = self.refs[index]
-        return Shard(self.path / ref.shard).episode(ref.position)
+        return self[index]
 
     def episodes(self) -> Iterator[Episode]:
         """All episodes, shard by shard."""

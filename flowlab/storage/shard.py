@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import EllipsisType
 from typing import Any
@@ -76,6 +77,18 @@ def episode_digest(episode: Episode) -> str:
     return digest.hexdigest()
 
 
+@dataclass(frozen=True, slots=True)
+class StoredArray:
+    """What an array of a shard is, without its values."""
+
+    path: str
+    """Below the shard: ``data/tracks``."""
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str
+
+
 class Shard:
     """A shard opened for reading."""
 
@@ -132,18 +145,18 @@ class Shard:
         estimated = any((self.path / path).exists() for path in QUALITY)
         return [s for s in SCHEMA if self.has(s) or not s.optional or (estimated and s.path in QUALITY)]
 
-    def describe(self) -> list[dict[str, Any]]:
-        """Name, dimensions, shape, type and unit of every array."""
+    def describe(self) -> list[StoredArray]:
+        """Every array, its values unread."""
         paths = [*(s.path for s in SCHEMA if self.has(s)), EPISODE_ENDS]
         arrays = {path: self._open(path) for path in paths}
         return [
-            {
-                "array": path,
-                "dimensions": ", ".join(map(str, getattr(a.metadata, "dimension_names", None) or ())),
-                "shape": " x ".join(map(str, a.shape)),
-                "type": str(a.dtype),
-                "unit": a.attrs.get("unit", ""),
-            }
+            StoredArray(
+                path=path,
+                dims=tuple(map(str, getattr(a.metadata, "dimension_names", None) or ())),
+                shape=a.shape,
+                dtype=str(a.dtype),
+                unit=str(a.attrs.get("unit", "")),
+            )
             for path, a in arrays.items()
         ]
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from flowlab.geometry.camera import Camera
 from flowlab.records import Clip, Tracks2D
@@ -43,7 +44,9 @@ class Rolling:
 
     clip: Clip
 
-    def move(self, xy: np.ndarray, start: np.ndarray | int, stop: np.ndarray | int) -> np.ndarray:
+    def move(
+        self, xy: Num[np.ndarray, "*#batch 2"], start: np.ndarray | int, stop: np.ndarray | int
+    ) -> Float[np.ndarray, "*out 2"]:
         """Where points (..., 2) of frame ``start`` are in frame ``stop``; exact, whatever their depth."""
         return _turn(xy, _angle(np.asarray(stop)) - _angle(np.asarray(start)))
 

@@ -22,12 +22,12 @@ def caption(episode: Episode, shown: int) -> str:
         f"{int(episode.point_count[0])} cloud points",
         f"{episode.queries.count} query points",
         f"{moves} of them move" + (f" ({shown} shown)" if shown < moves else ""),
-        _outcome(episode),
+        _ending(episode),
     ]
     return "   ·   ".join(parts)
 
 
-def _outcome(episode: Episode) -> str:
+def _ending(episode: Episode) -> str:
     if episode.tracks.quality is not None:  # of a recording, which nobody needs to tell whether it succeeded
         return sigma_summary(episode)
     return f"solved at step {int(episode.success.argmax())}" if episode.success.any() else "not solved"

@@ -28,7 +28,7 @@ SERIES_RGB = [
 """Lines of one plot, in turn."""
 SUCCESS_RGB = (255, 255, 255)
 PREDICTED_RGB = (232, 255, 84)
-"""What a policy expects: brighter than any role, and than clouds."""
+"""What a policy predicts: brighter than any role, and than clouds."""
 _PALETTE = np.array([ROLE_RGB[role] for role in (*Role, UNKNOWN)], np.uint8)  # so that -1 finds the last
 _CLOUD_GRAY = np.array([150, 154, 160])
 

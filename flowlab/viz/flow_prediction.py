@@ -1,4 +1,4 @@
-"""Predicted flow as one picture: where a policy's plan expects points to go, and where they went."""
+"""Predicted flow as one picture: where a policy's plan predicts points to go, and where they went."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def draw_flow_prediction(
 ) -> None:
     """Write a PNG of 1800 x 960 pixels. ``path`` is either absent, as before, or whole.
 
-    ``plan`` counts the plans of the episode from 0; by default it is the one that expects the objects to move
+    ``plan`` counts the plans of the episode from 0; by default it is the one that predicts the objects to move
     farthest. Raises :class:`DataError` where there is no such plan.
     """
     save_png(plot_flow_prediction(episode, prediction, title, plan), path)
@@ -82,7 +82,7 @@ def plot_flow_prediction(episode: Episode, prediction: FlowPrediction, title: st
 
 
 def _drawn_paths(episode: Episode, plan: PlanPrediction) -> Int[np.ndarray, "N"]:
-    """Points expected to move whose paths are drawn: the first few of each role, which lie far apart."""
+    """Points predicted to move whose paths are drawn: the first few of each role, which lie far apart."""
     role = episode.query_role[: episode.queries.count]
     return np.concatenate(
         [np.flatnonzero(plan.predicted_moving & (role == r))[:PATHS_PER_ROLE] for r in np.unique(role)]
@@ -102,9 +102,9 @@ def _caption(episode: Episode, plan: PlanPrediction, shown: int) -> str:
 
 
 def _fit_to(axes: Axes, flat: list[Float[np.ndarray, "..."]], points: Int[np.ndarray, "N"], around: float) -> None:
-    """Let the expected and true paths of some points fill the panel but for a share ``around``; or else the cloud."""
-    cloud, expected, true = flat
-    paths = np.concatenate([expected[:, points], true[:, points]]).reshape(-1, 2) if len(points) else cloud
+    """Let the predicted and true paths of some points fill the panel but for a share ``around``; or else the cloud."""
+    cloud, predicted, true = flat
+    paths = np.concatenate([predicted[:, points], true[:, points]]).reshape(-1, 2) if len(points) else cloud
     low, high = np.nanmin(paths, 0), np.nanmax(paths, 0)
     margin = around * (high - low).max()
     fit_limits(axes, np.stack([low - margin, high + margin]), 0)
@@ -119,16 +119,16 @@ def _draw_scene(
     depth: Float[np.ndarray, "P"],
     enlarged: float = 1.0,
 ) -> None:
-    """Cloud, expected and true paths, which ``flat`` holds in the plane of the axes."""
-    cloud, expected, true = flat
+    """Cloud, predicted and true paths, which ``flat`` holds in the plane of the axes."""
+    cloud, predicted, true = flat
     draw_cloud(axes, cloud, depth, cloud_rgb_at(episode, plan.step), 12 * enlarged**2)
 
     ink = role_rgb(episode.query_role[: episode.queries.count]) / 255 * 0.8
     still = ~plan.predicted_moving
-    start, end, true_end = expected[0].T, expected[-1, drawn].T, true[-1, drawn].T
+    start, end, true_end = predicted[0].T, predicted[-1, drawn].T, true[-1, drawn].T
     axes.scatter(start[0, still], start[1, still], 9, c=ink[still], linewidths=0, zorder=3)
     for k in drawn:
-        axes.add_collection(trail_lines(expected[:, k], 3.2), autolim=False)
+        axes.add_collection(trail_lines(predicted[:, k], 3.2), autolim=False)
     for width, color in ((1.5, "white"), (0.8, INK)):
         taken = LineCollection([*true[:, drawn].swapaxes(0, 1)], colors=color, linewidths=width, zorder=5)
         axes.add_collection(taken, autolim=False)

@@ -1,4 +1,4 @@
-"""Query points, their trails and what a policy expects of them, drawn over one enlarged picture of an episode."""
+"""Query points, their trails and what a policy predicts of them, drawn over one enlarged picture of an episode."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
@@ -14,7 +14,7 @@ _HIDDEN_LIGHT = 0.75
 _TRAIL_ALPHA = (0.9, 0.7, 0.45, 0.22)
 """How opaque a trail is, from its newest quarter to its oldest."""
 _PATH_RIM_ALPHA = 0.5
-"""How opaque the rim of an expected path is: there are many, and they lie close."""
+"""How opaque the rim of a predicted path is: there are many, and they lie close."""
 _SUBPIXEL = 4
 """Bits of OpenCV's fixed-point coordinates."""
 
@@ -42,7 +42,7 @@ class Overlay:
         self._plans = [] if prediction is None else plan_predictions(episode, prediction)
 
     def draw(self, canvas: UInt8[np.ndarray, "H W 3"], t: int) -> None:
-        """Draw trails, expected paths and points of step t onto the canvas."""
+        """Draw trails, predicted paths and points of step t onto the canvas."""
         self._draw_trails(canvas, t)
         in_force = [plan for plan in self._plans if plan.step <= t]
         if in_force:

@@ -22,7 +22,7 @@ class PlanPrediction:
     step: int
     """When it was made."""
     predicted_world: Float32[np.ndarray, "H M 3"]
-    """Row 0: where every point was then [m]; row k: where it was expected after k more actions."""
+    """Row 0: where every point was then [m]; row k: where it was predicted after k more actions."""
     true_world: Float32[np.ndarray, "K M 3"]
     """Where the points were [m], up to the step of the next plan (K - 1 actions of this one were executed)."""
 

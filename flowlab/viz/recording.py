@@ -25,9 +25,9 @@ _STILL_M = 1e-3
 _HIDDEN_LIGHT = 0.4
 """Brightness of what the camera does not see, against 1 for what it sees."""
 _LEGEND = (
-    "The bright yellow lines, which end in dots, are where the policy expected the points to go when it made its last "
-    f"plan, step by step; points that it expected to stay within {1000 * PREDICTED_M:.0f} mm have none. The flow error "
-    "is how far from there the points truly were at each step, on average over those that move more than "
+    "The bright yellow lines, which end in dots, are where the policy predicted the points to go when it made its last "
+    f"plan, step by step; points predicted to stay within {1000 * PREDICTED_M:.0f} mm have none. The flow error is how "
+    "far from there the points truly were at each step, on average over those that move more than "
     f"{1000 * MOVING_M:.0f} mm under the plan."
 )
 
@@ -117,7 +117,7 @@ def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -
 
 
 def _send_predictions(recording: rr.RecordingStream, episode: Episode, plans: Sequence[PlanPrediction]) -> None:
-    """The paths that each plan expects; one that expects none clears those of the plan before."""
+    """The paths that each plan predicts; one that predicts none clears those of the plan before."""
     drawn = [plan.predicted_world[:, plan.predicted_moving].swapaxes(0, 1) for plan in plans]
     times = _times(episode, [plan.step for plan in plans])
     counts = [len(paths) for paths in drawn]

@@ -20,7 +20,8 @@ import yaml
 from synthetic import call_cli, files_below
 from trained_runs import NETWORK, header_of, lines_of, make_run, options, policy_of, weights_of
 
-from flowlab.benchmark.experiment import load_experiment, plan_units
+from flowlab.benchmark.recipe import load_experiment
+from flowlab.benchmark.units import plan_units
 from flowlab.cli import main
 from flowlab.storage.dataset import Dataset
 
@@ -114,7 +115,8 @@ def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: 
         assert (about["policy"], about["steps"], about["demonstrations"]) == (policy, 2, 2)
         assert about["device"] == "cpu"
         assert about["settings"] == policy_of(run)["policy"]["settings"]
-        assert about["settings"]["motion"]["points"] == (4 if variant else 8)
+        motion = about["settings"].get("motion", {})
+        assert motion.get("points") == ({"m4": 4, "": 8}[variant] if policy == "fdp" else None)
         assert (about["settings"]["run"]["steps"], about["settings"]["run"]["minutes"]) == (2, None)
         tensors = header_of(run / "checkpoints/step-00000002.safetensors")
         shapes = [tensor["shape"] for key, tensor in tensors.items() if key != "__metadata__"]
@@ -144,6 +146,7 @@ def test_all_policies_of_a_task_share_a_dataset(experiment: Path) -> None:
 
 def test_a_unit_is_trained_as_by_hand(experiment: Path, tmp_path: Path) -> None:
     changes = options("data.demonstrations=2", "data.held_out=1", *SHORT, "motion.points=4")
+    changes += ["--profile", str(NETWORK)]
     data = shutil.copytree(experiment / "data" / TASK, tmp_path / "d")
     run = make_run(data, "--policy", "fdp", "--out", tmp_path / "run", *changes, "--device", "cpu")
     mine, theirs = weights_of(run, 2), weights_of(experiment / f"runs/{UNITS[2]}", 2)
@@ -280,11 +283,13 @@ def test_the_recipe_that_comes_with_flowlab_is_the_papers() -> None:
     assert {task for task in tasks if "fdp-m50" in labels[task]} == hard
     for u in units:
         assert u.settings.run.minutes == recipe.minutes
-        assert u.settings.motion.points <= recipe.query_points
+        flow = u.settings.needs.flow
+        assert flow is None or flow.points <= recipe.query_points
         assert u.dataset == f"data/{u.task}" + {"fdp-object": "-object", "fdp-stratified": "-stratified"}.get(
             u.label, ""
         )
-        assert {"fdp-m50": 50, "fdp-m200": 200}.get(u.label, 100) == u.settings.motion.points
+        points = {"fdp-m50": 50, "fdp-m200": 200}.get(u.label, 100)
+        assert (None if flow is None else flow.points) == (points if u.label.startswith("fdp") else None)
     assert [u.name for u in plan_units(load_experiment("paper", tasks=("push",), policies=("dp3",), variants=()))] == [
         "push-dp3"
     ]
@@ -331,7 +336,7 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
         {"variants": [{"name": "a", "tasks": [TASK], "set": [], "policy": "fpd"}]}, "no policy is called 'fpd'",
     ),
     "recipe of the datasets": ({"recipe": "metawrld"}, "no recipe is called 'metawrld'; did you mean metaworld"),
-    "seed without layouts": ({"seeds": [4000]}, "seed 4000: evaluation seeds are from 0 to 3999"),
+    "seed without scenes": ({"seeds": [4000]}, "seed 4000: evaluation seeds are from 0 to 3999"),
     "variants of one name": (
         {"variants": [{"name": "a", "tasks": [TASK], "set": [f"motion.points={k}"]} for k in (2, 3)]}, "fdp-a",
     ),

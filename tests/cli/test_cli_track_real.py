@@ -287,8 +287,8 @@ def test_a_mistake_gives_one_sentence_and_its_exit_code(
 
 def test_simulation_refuses_the_recipe_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, errors = call_cli(capsys, "extract-sim", "hammer", "--out", tmp_path / "x", "--recipe", "real")
-    assert code == 1
-    assert "needs an 'expert' stage" in errors
+    assert code == 2
+    assert "needs a stage that simulates" in errors
     assert list(tmp_path.iterdir()) == []
 
 

@@ -17,13 +17,15 @@ import flowlab
 from flowlab.data.batches import ObservationBatch
 from flowlab.deployment.policy import Policy
 from flowlab.errors import DataError, FlowlabError, UsageError
-from flowlab.evaluation.rollout import BATCH_SLOTS, Attempt, SimulatorPool, roll_out
+from flowlab.evaluation.rollout import BATCH_SLOTS, PolicyRollout, SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.geometry.camera import Camera
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings
 from flowlab.policies.base import ActionPlan, PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
+from flowlab.policies.dp3 import DP3
+from flowlab.policies.fdp import FDP
 from flowlab.records import Frame
 from flowlab.sim.simulation import SceneSettings
 
@@ -35,11 +37,19 @@ class Watched(PolicyNetwork):
 
     fixed = False
 
-    def plan(self, context: ObservationBatch, noise_from: Any = None) -> ActionPlan:
+    def plan(self, context: ObservationBatch, generators: Any = None) -> ActionPlan:
         self.__dict__.setdefault("seen", []).append(context)
-        plan = super().plan(context, noise_from)
+        plan = super().plan(context, generators)
         ramp = torch.linspace(-0.9, 0.9, plan.action.shape[1])[None, :, None].expand_as(plan.action)
         return ActionPlan(ramp, plan.flow) if self.fixed else plan
+
+
+class WatchedFDP(Watched, FDP):
+    """Of 3D FDP."""
+
+
+class WatchedDP3(Watched, DP3):
+    """Of DP3."""
 
 
 def network(name: str, **changes: Any) -> Watched:
@@ -50,52 +60,53 @@ def network(name: str, **changes: Any) -> Watched:
         "observer": ObserverSettings().model_dump(mode="json"),
         "queries": QuerySettings(points=6).model_dump(),
     }
-    return Watched(tiny_spec(settings, **values | changes))
+    kind: Any = {"fdp": WatchedFDP, "dp3": WatchedDP3}[name]
+    return kind(tiny_spec(settings, **values | changes))
 
 
 @pytest.fixture(scope="module")
-def stage() -> SimulatorPool:
+def pool() -> SimulatorPool:
     return SimulatorPool("hammer", SceneSettings())
 
 
-def drive(policy: Policy, stage: SimulatorPool, seed: int) -> np.ndarray:
+def drive(policy: Policy, pool: SimulatorPool, seed: int) -> np.ndarray:
     """What a user's loop does: the actions, before they are clipped."""
-    live = stage.simulator(BATCH_SLOTS).begin(seed)
+    recorder = pool.simulator(BATCH_SLOTS).begin(seed)
     actions = []
     for _ in range(STEPS):
-        frame = live.frame() if policy.wants_frame else None
-        actions.append(policy.act(frame, live.simulation.state))
-        live.step(np.clip(actions[-1], -1, 1))
+        frame = recorder.frame() if policy.wants_frame else None
+        actions.append(policy.act(frame, recorder.simulation.state))
+        recorder.step(np.clip(actions[-1], -1, 1))
     return np.stack(actions)
 
 
-def rolled_out(policy: PolicyNetwork, stage: SimulatorPool) -> Attempt:
-    return next(roll_out(policy, stage, [TRIAL], max_steps=STEPS))
+def rolled_out(policy: PolicyNetwork, pool: SimulatorPool) -> PolicyRollout:
+    return next(roll_out(policy, pool, [TRIAL], max_steps=STEPS))
 
 
 @pytest.mark.parametrize("name", ["fdp", "dp3"])
-def test_a_control_loop_acts_as_a_rollout_does(stage: SimulatorPool, name: str) -> None:
+def test_a_control_loop_acts_as_a_rollout_does(pool: SimulatorPool, name: str) -> None:
     policy = network(name)
-    attempt = rolled_out(policy, stage)
-    driven = drive(Policy(policy, "hammer", seed=TRIAL.scene_seed), stage, TRIAL.scene_seed)
-    np.testing.assert_allclose(np.clip(driven[:8], -1, 1), attempt.rollout.action[:8], atol=1e-4)
-    other = drive(Policy(policy, "hammer", seed=TRIAL.scene_seed + 1), stage, TRIAL.scene_seed)
+    episode = rolled_out(policy, pool)
+    driven = drive(Policy(policy, "hammer", seed=TRIAL.scene_seed), pool, TRIAL.scene_seed)
+    np.testing.assert_allclose(np.clip(driven[:8], -1, 1), episode.rollout.action[:8], atol=1e-4)
+    other = drive(Policy(policy, "hammer", seed=TRIAL.scene_seed + 1), pool, TRIAL.scene_seed)
     assert np.abs(other[:8] - driven[:8]).max() > 1e-2, "the noise is the seed's"
 
 
-def test_every_plan_of_a_control_loop_is_decided_on_what_a_rollout_shows(stage: SimulatorPool) -> None:
+def test_every_plan_of_a_control_loop_is_decided_on_what_a_rollout_shows(pool: SimulatorPool) -> None:
     policy = network("fdp")
     policy.fixed, policy.seen = True, []
-    rolled_out(policy, stage)
+    rolled_out(policy, pool)
     rolled, policy.seen = policy.seen, []
-    drive(Policy(policy, "hammer", seed=TRIAL.scene_seed), stage, TRIAL.scene_seed)
+    drive(Policy(policy, "hammer", seed=TRIAL.scene_seed), pool, TRIAL.scene_seed)
     assert len(rolled) == len(policy.seen) == 3
     for theirs, mine in zip(rolled, policy.seen, strict=True):
-        lane = TRIAL.episode % BATCH_SLOTS
-        frames = theirs.observed[lane]
+        slot = TRIAL.episode % BATCH_SLOTS
+        frames = theirs.observed[slot]
         assert torch.equal(mine.points[mine.observed[0]], theirs.points[frames])
         assert torch.equal(mine.state[mine.observed[0]], theirs.state[frames])
-        assert torch.equal(mine.queries[0], theirs.queries[lane])
+        assert torch.equal(mine.queries[0], theirs.queries[slot])
     assert not torch.equal(policy.seen[1].points, policy.seen[2].points)
 
 

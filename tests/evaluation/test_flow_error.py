@@ -36,15 +36,15 @@ class Case:
 def case() -> Case:
     """An expert hammers, and every body's pose is written down before every action."""
     simulation = (simulator := TaskSimulator("hammer", SceneSettings())).simulation
-    live = simulator.begin(1_000_000)
-    cloud = Observer(ObserverSettings(), "hammer").cloud(live.frame())
+    recorder = simulator.begin(1_000_000)
+    cloud = Observer(ObserverSettings(), "hammer").cloud(recorder.frame())
     queries = sample_queries(cloud, QuerySettings(points=12, sampling="stratified", object_share=0.5))
     model, data, expert = simulation.model, simulation.data, simulation.expert()
     position, turn = [], []
     for _ in range(45):
         position.append(data.xpos.copy())
         turn.append(data.xmat.reshape(-1, 3, 3).copy())
-        live.step(expert.act())
+        recorder.step(expert.act())
     truth = np.zeros((45, 12, 3))
     for m, owner in enumerate(queries.owner):
         body = model.geom_bodyid[owner] if owner < model.ngeom else model.site_bodyid[owner - model.ngeom]
@@ -54,8 +54,8 @@ def case() -> Case:
     eye = data.cam("corner2")
     depth = -((truth - eye.xpos) @ eye.xmat.reshape(3, 3))[..., 2]
     repeated = [*range(12), 0, 1, 2, 3]
-    padded = replace(queries, xyz_world=queries.xyz_world[repeated], owner=queries.owner[repeated])
-    return Case(live.rollout(), padded, truth, depth)
+    padded = replace(queries, xyz_world=queries.xyz_world[repeated], owner=queries.owner[repeated], pixel=None)
+    return Case(recorder.rollout(), padded, truth, depth)
 
 
 def by_hand(case: Case, predicted: Predicted, n_action_steps: int) -> RolloutFlowError | None:

@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 import torch
 from builders import tiny_settings, tiny_spec
-from synthetic import CAMERA, SETTINGS, call_cli, make_dataset, make_episode, with_tracks
+from synthetic import CAMERA, SETTINGS, call_cli, make_dataset, make_episode, make_provenance, with_tracks
 from trained_runs import SMALL, lines_of, make_rolls, make_run, options
 
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.errors import DataError
 from flowlab.evaluation.flow_metrics import FlowErrors
-from flowlab.evaluation.offline import DRAWS, OfflineReport, demonstration_rows, evaluate_offline, offline_rows
+from flowlab.evaluation.offline import OfflineReport, evaluate_offline
+from flowlab.evaluation.sampled_flow import DRAWS
 from flowlab.geometry.camera import Camera
 from flowlab.policies.base import ActionPlan, PolicyNetwork
 from flowlab.policies.checkpoint import LoadedPolicy, TrainedPolicy, load_policy
+from flowlab.policies.fdp import FDP
 from flowlab.records import Episode
+from flowlab.report.tables import demonstration_table, offline_table
 from flowlab.storage.dataset import Dataset
 
 Capture = pytest.CaptureFixture[str]
@@ -30,10 +33,10 @@ AHEAD, EXECUTED = 7, 4
 NEAR = Camera(CAMERA.width, CAMERA.height, CAMERA.K * [[3], [3], [1]], CAMERA.T_world_cam)
 
 
-class Drawer(PolicyNetwork):
-    """Foresees the flow of :func:`gliding`, off by (1 + (draw + row) % 10) mm more at every step, across the way."""
+class Drawer(FDP):
+    """Predicts the flow of :func:`gliding`, off by (1 + (draw + row) % 10) mm more at every step, across the way."""
 
-    def plan(self, context: ObservationBatch, noise_from: Any = None) -> ActionPlan:
+    def plan(self, context: ObservationBatch, generators: Any = None) -> ActionPlan:
         windows, s = len(context.observed), self.spec.settings
         row = context.state[context.observed[:, -1], 0].round().long()
         draw = torch.arange(windows) // (windows if isinstance(context, Batch) else windows // DRAWS)
@@ -106,7 +109,8 @@ def test_predicted_flow_is_off_by_what_one_works_out_by_hand(tmp_path: Path, own
     """Of a recording, the camera is its own. The first is planned in two portions, of 64 windows at most."""
     cameras = [NEAR if own_camera else CAMERA, CAMERA]
     demos = [gliding(k, steps, camera) for k, (steps, camera) in enumerate(zip((80, 14), cameras, strict=True))]
-    make_dataset(tmp_path / "d", [[d] for d in demos], **({"camera": {}} if own_camera else {}))
+    changes = {"provenance": make_provenance(camera={})} if own_camera else {}
+    make_dataset(tmp_path / "d", [[d] for d in demos], **changes)
     settings = tiny_settings("fdp", "encoder.points=24")
     report = evaluate_offline(untrained(tmp_path, Drawer, settings), tmp_path / "d")
     wanted = [by_hand(d) for d in demos]
@@ -144,12 +148,12 @@ def test_where_nothing_moves_there_is_no_such_figure(tmp_path: Path) -> None:
 
 def test_draws_of_a_real_policy_differ_and_the_best_is_better(tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[gliding(0, 20, CAMERA)]])
-    loaded = untrained(tmp_path, PolicyNetwork, tiny_settings("fdp"))
+    loaded = untrained(tmp_path, FDP, tiny_settings("fdp"))
     report = evaluate_offline(loaded, tmp_path / "d")
     assert report.all.flow is not None
     assert report.all.flow.best_ade_mm < 0.95 * report.all.flow.policy.ade_mm
     assert evaluate_offline(loaded, tmp_path / "d") == report, "the noise is the same each time"
-    one_frame = untrained(tmp_path, PolicyNetwork, tiny_settings("fdp", "n_obs_steps=1"))
+    one_frame = untrained(tmp_path, FDP, tiny_settings("fdp", "n_obs_steps=1"))
     found = evaluate_offline(one_frame, tmp_path / "d").all
     assert found.flow is not None
     assert found.flow.constant is None
@@ -195,24 +199,24 @@ def test_a_dataset_that_was_moved_is_still_the_runs_own(run: Path, data: Path, t
 def test_of_other_data_every_demonstration_counts(run: Path, tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[make_episode(k, steps=20) for k in (0, 1, 7)]])
     report = evaluate_offline(load_policy(run), tmp_path / "d")
-    assert seeds(report) == [0, 1, 7], "recordings have no layout that two datasets could share"
+    assert seeds(report) == [0, 1, 7], "recordings have no scene that two datasets could share"
     assert report.dataset == str(tmp_path / "d")
 
 
 def test_tables_show_what_there_is(run: Path) -> None:
     report = evaluate_offline(load_policy(run))
-    columns, rows = offline_rows(report)
-    table = {row[0]: row[1:] for row in rows}
+    table = offline_table(report)
+    rows = {name: values for name, *values in table.rows}
     e = report.all.errors
-    assert table["action L1"] == [e.action_l1, e.action_l1_zero, e.action_l1_hold]
+    assert rows["action L1"] == [e.action_l1, e.action_l1_zero, e.action_l1_hold]
     assert len(rows) == {"dp3": 1, "mba": 2, "fdp": 9}[run.name]
     if report.all.flow is not None:
-        assert table["ADE mm, best of 10 draws"] == [report.all.flow.best_ade_mm, "-", "-"]
-    assert all(len(row) == len(columns) for row in rows)
-    columns, rows = demonstration_rows(report)
-    assert [row[0] for row in rows] == ["roll 4", "roll 5"]
-    assert ("pose mm" in columns, "3D-AJ" in columns) == (run.name == "mba", run.name == "fdp")
-    assert all(len(row) == len(columns) for row in rows)
+        assert rows["ADE mm, best of 10 draws"] == [report.all.flow.best_ade_mm, "-", "-"]
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    table = demonstration_table(report)
+    assert [row[0] for row in table.rows] == ["roll 4", "roll 5"]
+    assert ("pose mm" in table.columns, "3D-AJ" in table.columns) == (run.name == "mba", run.name == "fdp")
+    assert all(len(row) == len(table.columns) for row in table.rows)
 
 
 def simulated(folder: Path, numbers: Sequence[int]) -> Path:
@@ -222,7 +226,7 @@ def simulated(folder: Path, numbers: Sequence[int]) -> Path:
     return folder
 
 
-def test_layouts_that_were_trained_on_are_left_out_of_other_data(tmp_path: Path) -> None:
+def test_scenes_that_were_trained_on_are_left_out_of_other_data(tmp_path: Path) -> None:
     data = simulated(tmp_path / "d", range(2, 6))
     run = make_run(data, "--policy", "dp3", "--out", tmp_path / "run", *SMALL)
     assert seeds(evaluate_offline(load_policy(run))) == [5]
@@ -230,7 +234,7 @@ def test_layouts_that_were_trained_on_are_left_out_of_other_data(tmp_path: Path)
     assert seeds(evaluate_offline(load_policy(run), more)) == [0, 1, 5, 6, 7]
     (run / "run.json").unlink()
     assert seeds(evaluate_offline(load_policy(run), more)) == [0, 1, 6, 7], "5 may have been trained on, then"
-    with pytest.raises(DataError, match=r"trained on the layouts of all its 2 demonstrations; give a dataset with oth"):
+    with pytest.raises(DataError, match=r"trained on the scenes of all its 2 demonstrations; give a dataset with oth"):
         evaluate_offline(load_policy(run), simulated(tmp_path / "few", (3, 4)))
 
 
@@ -252,7 +256,7 @@ def test_what_cannot_be_evaluated_is_told_in_a_sentence(tmp_path: Path) -> None:
     make_rolls(tmp_path / "seen", settings={**SETTINGS, "observer": {"points": 32}})
     assert "observer.points: the dataset has 32, the policy has 64" in refused(run, tmp_path / "seen")
     make_dataset(tmp_path / "blind", [[make_episode(steps=20, object_pose=False)]])
-    assert "has no object poses, which mba predicts" in refused(run, tmp_path / "blind")
+    assert "has no object poses, which mba needs" in refused(run, tmp_path / "blind")
     shutil.move(data, tmp_path / "gone")
     assert refused(run) == f"{run}: its dataset is no longer at {data}; give where it is now with --data"
     make_rolls(data, 7)

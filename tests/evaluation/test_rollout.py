@@ -16,6 +16,8 @@ from flowlab.evaluation.trials import SCENES_PER_SEED, Trial
 from flowlab.perception.observer import Box, ObserverSettings
 from flowlab.perception.queries import QuerySettings
 from flowlab.policies.base import ActionPlan, Generators, PolicyNetwork
+from flowlab.policies.dp3 import DP3
+from flowlab.policies.fdp import FDP
 from flowlab.records import Episode, Frame
 from flowlab.sim.recorder import EpisodeRecorder, ExpertSettings, TaskSimulator
 from flowlab.sim.simulation import SceneSettings
@@ -38,7 +40,7 @@ class Seen:
     contexts: list[ObservationBatch] = field(default_factory=list)
 
 
-class Repeater(PolicyNetwork):
+class Repeater(DP3):
     """Plans given actions, and remembers what the first slot was shown."""
 
     def repeat(self, action: np.ndarray, n_action_steps: int) -> Seen:
@@ -62,14 +64,13 @@ def spec_values(task: str, queries: int = 20, **observer: Any) -> dict[str, Any]
 
 
 def repeater(name: str, task: str, history: int = 2, **observer: Any) -> Repeater:
-    settings = tiny_settings(
-        name, f"horizon={HORIZON}", "n_action_steps=8", "encoder.points=1024", f"n_obs_steps={history}"
-    )
+    changes = [f"horizon={HORIZON}", "n_action_steps=8", "encoder.points=1024", f"n_obs_steps={history}"]
+    settings = tiny_settings(name, *changes, *(["motion.points=20"] if name == "fdp" else []))
     return Repeater(tiny_spec(settings, **spec_values(task, **observer)))
 
 
 def demonstrated(episode: Episode) -> Trial:
-    """The trial whose layout is that of a demonstration; no evaluation has it."""
+    """The trial whose scene is that of a demonstration; no evaluation has it."""
     trial = Trial(episode.task, -1, episode.seed)
     assert trial.scene_seed == episode.seed
     return trial
@@ -179,7 +180,7 @@ def noisy() -> PolicyNetwork:
     """A policy that has learned nothing: its actions come of its noise."""
     torch.manual_seed(0)
     settings, values = tiny_settings("fdp", "encoder.points=64"), spec_values("hammer", 6, points=64)
-    return PolicyNetwork(tiny_spec(settings, **{**values, "tasks": ("assembly", "hammer")})).eval()
+    return FDP(tiny_spec(settings, **{**values, "tasks": ("assembly", "hammer")})).eval()
 
 
 def by_trial(episodes: Sequence[PolicyRollout]) -> dict[Trial, PolicyRollout]:
@@ -224,7 +225,7 @@ def test_noise_is_the_trials_own(hammer: SimulatorPool) -> None:
     policy = noisy()
     noise: list[torch.Tensor] = []
 
-    class Listener(PolicyNetwork):
+    class Listener(FDP):
         def plan(self, context: ObservationBatch, generators: Generators = None) -> ActionPlan:
             assert isinstance(generators, Sequence)
             noise.append(torch.stack([torch.randn(7, generator=g) for g in generators]))
@@ -305,9 +306,9 @@ def test_a_first_view_that_is_empty_fails_the_episode_too(reach: SimulatorPool) 
         assert (outcome.success, outcome.success_dp3, outcome.flow) == (False, False, None)
 
 
-def test_a_stage_makes_a_simulation_once() -> None:
-    stage = SimulatorPool("reach", SceneSettings())
-    first = stage.simulator(1)
-    assert stage.simulator(1) is first
-    assert stage.simulator(2) is not first
+def test_a_pool_makes_a_simulator_once() -> None:
+    pool = SimulatorPool("reach", SceneSettings())
+    first = pool.simulator(1)
+    assert pool.simulator(1) is first
+    assert pool.simulator(2) is not first
     assert isinstance(first, TaskSimulator)

@@ -59,7 +59,7 @@ def test_scenes_that_were_demonstrated_are_refused() -> None:
     with pytest.raises(UsageError) as raised:
         check_unseen(wanted, seen, Path("runs/a"))
     assert str(raised.value) == (
-        "runs/a: its dataset holds the layout 2000001 of push, which evaluation seed 1 would try; demonstrations "
+        "runs/a: its dataset holds the scene 2000001 of push, which evaluation seed 1 would try; demonstrations "
         "belong below 1,000,000: make them with another first_seed, or evaluate other --seeds"
     )
     check_unseen([t for t in wanted if t.scene_seed != 2_000_001], seen, Path("runs/a"))

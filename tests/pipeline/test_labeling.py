@@ -13,7 +13,8 @@ from synthetic_clip import BOARD_M, CAMERA, WALL_M, film, record, truth
 
 from flowlab.engines.base import UnitResult
 from flowlab.errors import DataError, UsageError
-from flowlab.pipeline.labeling import estimate_cost, find_jobs, inspect_recording, label_recordings
+from flowlab.pipeline.inspection import estimate_cost, inspect_recordings
+from flowlab.pipeline.labeling import find_jobs, label_recordings
 from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.stages.recording import LiftStage, QualityStage, TrackStage
@@ -309,10 +310,11 @@ def without_depth(folder: Path) -> None:
 def test_a_look_says_what_is_there_even_where_something_is_missing(tmp_path: Path, recipe: Recipe) -> None:
     record(tmp_path / "a/b", 5)
     without_depth(tmp_path / "a/c")
-    whole, empty = (inspect_recording(recipe, r) for r in find_jobs(recipe, [tmp_path / "a"]))
-    assert not isinstance(whole, DataError)
-    assert (whole.rows, whole.problem) == (5, None)
-    assert isinstance(empty, DataError)
+    whole, empty = inspect_recordings(recipe, find_jobs(recipe, [tmp_path / "a"]))
+    assert whole.description is not None
+    assert (whole.description.rows, whole.problem) == (5, None)
+    assert empty.description is None
+    assert empty.problem
 
 
 def test_a_forecast_is_measured_on_what_can_be_labeled(tmp_path: Path, recordings: Path, recipe: Recipe) -> None:

@@ -243,7 +243,8 @@ def test_simulation_needs_no_trackers_and_recordings_no_simulator() -> None:
         ("metaworld", ["cv2", "torch", "open3d", "flowlab.recordings"]),
         ("real", ["mujoco", "torch", "open3d"]),
     ):
-        code = "import sys; from flowlab.pipeline import worker, extraction; from flowlab.pipeline.recipe import load_recipe\n"
+        code = "import sys; from flowlab.pipeline import worker, filling\n"
+        code += "from flowlab.pipeline.recipe import load_recipe\n"
         code += f"load_recipe({recipe!r}).pipeline(); print([m for m in {foreign!r} if m in sys.modules])"
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert result.stdout.strip() == "[]"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from flowlab.engines.base import UnitResult
 from flowlab.errors import UsageError
-from flowlab.pipeline.extraction import run_all
+from flowlab.pipeline.filling import run_all
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler, SeedScheduler, next_units, unit_size
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.storage.dataset import keep_receipt

@@ -1,5 +1,6 @@
 """The profiles of training: what they say, that they say all of it, and what is said of wrong values."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,62 +9,107 @@ import pytest
 import yaml
 
 from flowlab.config import Settings
-from flowlab.data.settings import TrainSettings
+from flowlab.data.needs import Needs
+from flowlab.data.settings import BatchSettings, TrainSettings
 from flowlab.errors import UsageError
-from flowlab.policies.settings import load_settings
+from flowlab.policies.fdp import FDPSettings
+from flowlab.policies.migrations import migrate_policy
+from flowlab.policies.settings import load_settings, settings_class
 
 PROFILES = Path(__file__).parents[2] / "pipelines/train"
 POLICIES = ["fdp", "dp3", "mba"]
 
 
+OLD = Path(__file__).parents[1] / "fixtures/old/settings.json"
+"""What the profiles came to when they still said everything, at commit 79a7dbb."""
+
+
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("profile", ["fast", "paper"])
-def test_the_profiles_suit_every_policy(profile: str, policy: str) -> None:
-    settings = load_settings(profile, policy)
-    assert settings.policy == policy
-    values = yaml.safe_load((PROFILES / f"{profile}.yaml").read_text())
-    assert settings.model_dump(mode="json") == {"policy": policy, **values}
+def test_the_profiles_say_what_they_said(profile: str, policy: str) -> None:
+    """By today's names, and without what was another policy's."""
+    old = json.loads(OLD.read_text())[f"{profile}/{policy}"]
+    wanted = migrate_policy({"format": 1, "policy": {"settings": old}})["policy"]["settings"]
+    assert load_settings(profile, policy).model_dump(mode="json") == wanted
 
 
-def keys(model: type[Settings], where: str = "") -> Iterator[str]:
-    """Every setting of a model, by its path."""
-    for name, field in model.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, Settings):
-            yield from keys(inner, f"{where}{name}.")
-        else:
-            yield where + name
+@pytest.mark.parametrize("policy", POLICIES)
+def test_the_defaults_are_the_fast_profile(policy: str) -> None:
+    assert load_settings("fast", policy) == settings_class(policy)()
+    assert yaml.safe_load((PROFILES / "fast.yaml").read_text()) is None
 
 
-def keys_in(values: dict[str, Any], where: str = "") -> Iterator[str]:
+def said(values: dict[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, dict):
-            yield from keys_in(value, f"{where}{name}.")
+            yield from said(value, f"{where}{name}.")
         else:
-            yield where + name
+            yield where + name, value
 
 
-@pytest.mark.parametrize("profile", sorted(PROFILES.glob("*.yaml")), ids=lambda p: p.stem)
-def test_a_profile_says_everything(profile: Path) -> None:
-    """So that to read it is to know the run; and no setting has a second default in the code."""
-    said = sorted(keys_in(yaml.safe_load(profile.read_text())))
-    known = sorted(keys(TrainSettings))
-    assert len(known) > 50
-    assert [*said, "policy"] == [*(k for k in known if k != "policy"), "policy"]
+@pytest.mark.parametrize("policy", POLICIES)
+def test_the_paper_profile_says_what_differs_only(policy: str) -> None:
+    values = yaml.safe_load((PROFILES / "paper.yaml").read_text())
+    own = values.pop("policies")[policy]
+    defaults = dict(said(settings_class(policy)().model_dump(mode="json")))
+    told = {**dict(said(values)), **dict(said(own))}
+    assert len(told) > 8
+    assert {key for key, value in told.items() if defaults[key] == value} == set()
 
 
-def test_no_setting_has_a_default_in_the_code() -> None:
-    values = yaml.safe_load((PROFILES / "fast.yaml").read_text())
-    for path in keys_in(values):
-        *groups, name = path.split(".")
-        without = yaml.safe_load((PROFILES / "fast.yaml").read_text())
-        target = without
-        for group in groups:
-            target = target[group]
-        del target[name]
-        with pytest.raises(ValueError, match="Field required") as caught:
-            TrainSettings.model_validate({"policy": "fdp", **without})
-        assert ".".join(map(str, caught.value.errors()[0]["loc"])) == path  # type: ignore[attr-defined]
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_setting_has_a_default(policy: str) -> None:
+    def required(model: type[Settings], where: str = "") -> Iterator[str]:
+        for name, field in model.model_fields.items():
+            if field.is_required():
+                yield where + name
+            if isinstance(field.default, Settings):
+                yield from required(type(field.default), f"{where}{name}.")
+
+    assert list(required(settings_class(policy))) == []
+
+
+def test_a_group_given_in_part_keeps_the_defaults_of_its_place() -> None:
+    """A denoiser's widths are others for the motion than for the action."""
+    settings = FDPSettings.model_validate(
+        {"motion": {"denoiser": {"step_embedding": 8}}, "action": {"step_embedding": 8}}
+    )
+    assert settings.motion.denoiser.widths == (128, 128, 128)
+    assert settings.action.widths == (512, 512, 512)
+    assert settings == load_settings("fast", "fdp", ["motion.denoiser.step_embedding=8", "action.step_embedding=8"])
+
+
+def test_a_profile_says_only_what_differs_from_another(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(
+        "extends: paper\nbatch: {windows: 32}\npolicies:\n  fdp: {motion: {points: 7}}\n  dp3: {horizon: 24}\n"
+    )
+    (tmp_path / "b.yaml").write_text("extends: a.yaml\nbatch: {draws: 3}\nhorizon: 32\n")
+    found = load_settings(str(tmp_path / "b.yaml"), "fdp", ["motion.features=9"])
+    paper = load_settings("paper", "fdp")
+    assert found == paper.model_copy(
+        update={
+            "horizon": 32,
+            "batch": paper.batch.model_copy(update={"windows": 32, "draws": 3}),
+            "motion": paper.motion.model_copy(update={"points": 7, "features": 9}),
+        }
+    )
+    assert load_settings(str(tmp_path / "b.yaml"), "dp3").horizon == 32, "what extends comes after what is extended"
+    assert load_settings(str(tmp_path / "a.yaml"), "dp3").horizon == 24
+
+
+def test_a_wrong_value_in_python_is_one_sentence_too() -> None:
+    for make, sentence in (
+        (lambda: FDPSettings(horizon=0), "FDPSettings: horizon: Input should be greater than 0 (found 0)"),
+        (
+            lambda: FDPSettings(horison=8),
+            "FDPSettings: horison: no setting is called 'horison'; did you mean horizon or motion?",
+        ),
+        (lambda: BatchSettings(windows=7), "BatchSettings: 7 windows cannot be cut into segments of 8"),
+        (lambda: TrainSettings(), "TrainSettings: policy: Field required"),
+    ):
+        with pytest.raises(UsageError) as caught:
+            make()
+        assert str(caught.value) == sentence
 
 
 PAPER = {
@@ -102,7 +148,7 @@ def test_the_papers_numbers_are_the_papers(key: str) -> None:
 def test_overrides_are_yaml_and_the_last_one_counts() -> None:
     settings = load_settings(
         "fast", "fdp", ["motion.points=50", "run.minutes=null", "action.widths=[8, 8]", "motion.points=51",
-        "optimizer={learning_rate: 2e-3, betas: [0, 0], weight_decay: 0, warmup_steps: 0, ema_power: 1, ema_max: 0}"],
+        "optimizer={learning_rate: 2e-3, betas: [0, 0]}"],
     )  # fmt: skip
     assert (settings.motion.points, settings.run.minutes, settings.action.widths) == (51, None, (8, 8))
     assert (settings.optimizer.learning_rate, settings.optimizer.betas) == (2e-3, (0, 0))
@@ -157,10 +203,13 @@ def test_a_wrong_value_is_named_by_its_path(change: str) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ("motion.points", "--set motion.points: must look like motion.points=50"),
-        ("=3", "--set =3: must look like motion.points=50"),
-        ("motion.=3", "--set motion.=3: must look like motion.points=50"),
-        ("points=3", "no setting is called 'points'; there are: action, batch, "),
+        ("motion.points", "--set motion.points: must look like batch.windows=64"),
+        ("=3", "--set =3: must look like batch.windows=64"),
+        ("motion.=3", "--set motion.=3: must look like batch.windows=64"),
+        (
+            "points=3",
+            "no setting of fdp is called 'points'; there are: action, batch, data, diffusion, encoder, horizon, ",
+        ),
         ("n_obs_steps.frames=3", "--set n_obs_steps.frames=3: 'n_obs_steps' holds a value, not further settings"),
         ("encoder.widths=[16", "--set encoder.widths=[16: not valid YAML: '[16'"),
     ],
@@ -171,13 +220,26 @@ def test_a_change_that_cannot_be_made_is_shown(change: str, sentence: str) -> No
     assert str(caught.value).startswith(sentence)
 
 
+def test_a_setting_of_another_policy_is_unknown() -> None:
+    with pytest.raises(UsageError, match=r"^no setting of dp3 is called 'motion'; there are: action, batch, .*, run$"):
+        load_settings("fast", "dp3", ["motion.points=50"])
+    with pytest.raises(UsageError, match=r"motion.points: no setting is called 'points'; there are: condition, "):
+        load_settings("fast", "mba", ["motion.points=50"])
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "a profile is a mapping with the keys policy, n_obs_steps, horizon, "),
-        ("[1, 2]", "a profile is a mapping with the keys "),
+        ("[1, 2]", "must be a mapping of settings, as in 'extends: fast' and 'horizon: 8'"),
         ("n_obs_steps: [", "not valid YAML: "),
-        ("n_obs_steps: 2", "horizon: Field required"),
+        ("history: 2", "no setting of fdp is called 'history'; there are: "),
+        ("extends: mine.yaml", "extends itself ("),
+        ("extends: [fast]", "extends: must be the name of a profile or a file; found ['fast']"),
+        ("policies: [fdp]", "policies: must hold settings by policy, as in 'fdp: {motion: {points: 50}}'"),
+        ("policies: {fpd: {horizon: 8}}", "policies: no policy is called 'fpd'; did you mean fdp?"),
+        ("policies: {dp3: 3}", "policies: must hold settings by policy"),
+        ("policy: dp3", "is for policy dp3, and fdp was asked for"),
+        ("batch: 3", "batch: Input should be a valid dictionary"),
     ],
 )
 def test_a_profile_that_is_none_is_refused(text: str, sentence: str, tmp_path: Path) -> None:
@@ -185,3 +247,19 @@ def test_a_profile_that_is_none_is_refused(text: str, sentence: str, tmp_path: P
     with pytest.raises(UsageError) as caught:
         load_settings(str(tmp_path / "mine.yaml"), "fdp")
     assert str(caught.value).startswith(f"profile {tmp_path / 'mine.yaml'}: {sentence}")
+
+
+def test_a_profile_that_is_not_there_is_named() -> None:
+    with pytest.raises(UsageError, match=r"no profile is called 'fats'; did you mean fast\?"):
+        load_settings("fats", "fdp")
+
+
+def test_policies_on_pictures_are_not_trained_on_moved_scenes() -> None:
+    class Pictures(TrainSettings):
+        @property
+        def needs(self) -> Needs:
+            return Needs(rgb=True)
+
+    with pytest.raises(UsageError, match=r"batch.shift_m is 0.1 and batch.turn_deg 20.0, and x is trained on pictures"):
+        Pictures(policy="x")
+    Pictures(policy="x", batch=BatchSettings(shift_m=0, turn_deg=0))

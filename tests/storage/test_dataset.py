@@ -12,8 +12,8 @@ import pytest
 from conftest import Cli
 from synthetic import assert_same, files_below, make_dataset, make_episode, make_manifest, make_receipt, with_quality
 
-from flowlab.errors import DataError
-from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarize
+from flowlab.errors import DataError, UsageError
+from flowlab.storage.dataset import Dataset, begin, keep_receipt, open_dataset, summarize
 from flowlab.storage.manifest import MANIFEST, Receipt, Reject, StageTally
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.shard import Shard, write_shard
@@ -37,6 +37,59 @@ def test_a_position_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     for index in (2, -1):
         with pytest.raises(DataError, match=f"no episode {index}; there are 2, counted from 0"):
             dataset.episode(index)
+
+
+def test_a_dataset_is_a_sequence_of_its_episodes(tmp_path: Path) -> None:
+    roll0, roll1, roll2, push0, push1, push2 = EPISODES
+    ordered = [push0, push1, push2, roll0, roll1, roll2]
+    make_dataset(tmp_path, [[roll0, roll2], [push0, push1, push2], [roll1]])
+    dataset = open_dataset(tmp_path)
+    assert len(dataset) == 6
+    for k, expected in enumerate(ordered):
+        assert_same(expected, dataset[k])
+        assert_same(expected, dataset[k - 6])
+    assert [(e.task, e.seed) for e in dataset] == [(e.task, e.seed) for e in ordered]
+    for expected, found in zip(ordered, dataset, strict=True):
+        assert_same(expected, found)
+    for index in (6, -7):
+        with pytest.raises(IndexError, match=rf"no episode {index}; there are 6, counted from 0"):
+            dataset[index]
+
+
+def test_part_of_a_dataset_is_one_too(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path, [EPISODES[:3], EPISODES[3:]])
+    assert dataset.tasks == ("push", "roll")
+    roll = dataset.task("roll")
+    assert [(e.task, e.seed) for e in roll] == [("roll", 0), ("roll", 1), ("roll", 2)]
+    assert_same(EPISODES[2], roll[-1])
+    assert [(r.task, r.seed) for r in dataset[1:5:2].refs] == [("push", 1), ("roll", 0)]
+    assert [e.seed for e in roll[1:]] == [1, 2]
+    assert roll.tasks == ("roll",)
+    with pytest.raises(UsageError, match=rf"no task in {tmp_path} is called 'rol'; did you mean roll"):
+        dataset.task("rol")
+
+
+def test_a_dataset_says_in_two_lines_what_it_holds(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path / "a", [EPISODES[:3], EPISODES[3:]])
+    first, second = repr(dataset).split("\n")
+    assert first == f"Dataset '{tmp_path / 'a'}': 6 episodes, 42 frames, 2 tasks (push 3, roll 3)"
+    assert second == (
+        "  arrays: time, point_cloud[64, 3], point_count, state[9], action[4], success, tracks[8, 3], visible[8], "
+        "object_pose[9]"
+    )
+    assert repr(dataset.task("push")).startswith(f"DatasetView '{tmp_path / 'a'}': 3 episodes")
+    seen = make_dataset(tmp_path / "b", [[with_quality(make_episode(depth=True, rgb=True))]])
+    assert "depth[12, 16], rgb[12, 16, 3], sigma[8]" in repr(seen)
+    shutil.rmtree(tmp_path / "b" / "shards")
+    assert "arrays: unreadable (" in repr(Dataset(tmp_path / "b"))
+    begin(tmp_path / "c", make_manifest({"roll": 1}))
+    assert repr(Dataset(tmp_path / "c")).endswith("0 episodes, 0 frames, 0 tasks ()\n  arrays: none yet")
+
+
+def test_a_folder_that_does_not_exist_is_a_missing_file_too(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no such folder") as error:
+        open_dataset(tmp_path / "none")
+    assert isinstance(error.value, DataError)
 
 
 def test_the_fingerprint_is_of_the_content_not_of_its_making(tmp_path: Path) -> None:

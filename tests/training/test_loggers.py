@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from flowlab.errors import MissingLibraryError, UsageError
-from flowlab.training.loggers import LOGS, make_logger
+from flowlab.training.loggers import make_logger
 
 SETTINGS = {"policy": "fdp", "optimizer": {"learning_rate": 0.001, "betas": [0.95, 0.999]}}
 BLOCK = 32768
@@ -145,7 +145,7 @@ def test_wandb_without_an_account_says_what_to_do(tmp_path: Path) -> None:
     assert not (tmp_path / "wandb-id.txt").exists()
 
 
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("name", ["tensorboard", "wandb"])
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     for module in [m for m in sys.modules if m.startswith(("torch.utils.tensorboard", "tensorboard", "wandb"))]:
         monkeypatch.delitem(sys.modules, module)
@@ -158,5 +158,5 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_an_unknown_log_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no log is called 'tensorbord'; did you mean tensorboard"):
+    with pytest.raises(UsageError, match="no logger is called 'tensorbord'; did you mean tensorboard"):
         make_logger("tensorbord", tmp_path, "push-fdp", SETTINGS)

@@ -10,17 +10,17 @@ import numpy as np
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
-from flowlab.recordings.metadata import FILE_NAME, Metadata
+from flowlab.recordings.metadata import FILE_NAME, Metadata, Topics
 from flowlab.recordings.readers.realsense import is_sdk_bag
 from flowlab.recordings.readers.ros_bag import BagIndex, RosBag
 from flowlab.recordings.readers.ros_messages import (
-    camera_of,
     decode_image,
-    flatten,
+    depth_unit_of,
+    intrinsics_of,
     is_color,
     is_depth,
+    message_numbers,
     relative_pose,
-    unit_of,
 )
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -89,14 +89,8 @@ class ChosenTopics:
 
 def choose_topics(bag: RosBag, given: Metadata) -> ChosenTopics:
     """The topics of one camera and of the robot. Raises :class:`DataError` with the choices where several fit."""
-    types, asked = bag.types(), given.topics
-    for what, topic in asked.model_dump(exclude_none=True).items():
-        if topic not in types:
-            raise DataError(f"{bag.path}: has no topic '{topic}' ({what}); it has {', '.join(sorted(types)) or 'none'}")
-        expected = {"color": IMAGES, "depth": IMAGES, "color_info": (INFO,), "depth_info": (INFO,)}.get(what)
-        if expected is not None and types[topic] not in expected:
-            raise DataError(f"{bag.path}: the topic {topic} ({what}) holds {types[topic]}, expected {expected[0]}")
-        bag.first(topic)
+    asked = given.topics
+    _check_asked(bag, asked)
     images = bag.topics(*IMAGES)
     first = {topic: bag.first(topic) for topic in images if topic not in (asked.color, asked.depth)}
     colors = [t for t in first if is_color(first[t]) and "infra" not in t]
@@ -114,6 +108,18 @@ def choose_topics(bag: RosBag, given: Metadata) -> ChosenTopics:
         asked.color_info or _info_of(color, infos),
         asked.depth_info or _info_of(depth, infos),
     )
+
+
+def _check_asked(bag: RosBag, asked: Topics) -> None:
+    """Refuse topics that do not exist, hold something else, or are empty."""
+    types = bag.types()
+    for what, topic in asked.model_dump(exclude_none=True).items():
+        if topic not in types:
+            raise DataError(f"{bag.path}: has no topic '{topic}' ({what}); it has {', '.join(sorted(types)) or 'none'}")
+        expected = {"color": IMAGES, "depth": IMAGES, "color_info": (INFO,), "depth_info": (INFO,)}.get(what)
+        if expected is not None and types[topic] not in expected:
+            raise DataError(f"{bag.path}: the topic {topic} ({what}) holds {types[topic]}, expected {expected[0]}")
+        bag.first(topic)
 
 
 def _prefer(topics: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -155,9 +161,9 @@ def _calibration(bag: RosBag, topics: ChosenTopics) -> tuple[bool, tuple[tuple[s
     registered = any(name in topics.depth for name in REGISTERED) or (frames[0] == frames[1] != "")
     known: list[tuple[str, dict[str, Any]]] = []
     if topics.color_info is not None:
-        known.append((topics.color_info, {"intrinsics": camera_of(bag.first(topics.color_info), topics.color)}))
+        known.append((topics.color_info, {"intrinsics": intrinsics_of(bag.first(topics.color_info), topics.color)}))
     if not registered and topics.depth_info is not None:
-        camera = camera_of(bag.first(topics.depth_info), topics.depth)
+        camera = intrinsics_of(bag.first(topics.depth_info), topics.depth)
         known.append((topics.depth_info, {"depth_intrinsics": camera}))
     if not registered:
         static = [t for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")
@@ -172,7 +178,7 @@ def _unit(bag: RosBag, depth: str) -> tuple[str, Metadata]:
     for topic in bag.topics("std_msgs/msg/String", "std_msgs/msg/Float32"):
         if topic.endswith(SDK_UNIT) and _camera(topic) == _camera(depth):
             return topic, Metadata(depth_unit_m=float(bag.first(topic).data))
-    return "the custom of ROS (REP 118)", Metadata(depth_unit_m=unit_of(bag.first(depth)))
+    return "the custom of ROS (REP 118)", Metadata(depth_unit_m=depth_unit_of(bag.first(depth)))
 
 
 def _is_off(index: BagIndex) -> bool:
@@ -205,7 +211,7 @@ class _Topic:
 
     def samples(self, what: str) -> SampleStream:
         """Its messages as rows of numbers."""
-        rows = [flatten(message) for _, message in self.bag.messages(self.name)]
+        rows = [message_numbers(message) for _, message in self.bag.messages(self.name)]
         widths = sorted({len(row) for row in rows})
         if len(widths) != 1 or not widths[0]:
             raise DataError(

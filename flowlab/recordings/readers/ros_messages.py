@@ -38,7 +38,7 @@ def is_color(message: Any) -> bool:
     return message.encoding in ("rgb8", "bgr8", "rgba8", "bgra8", "8UC3")
 
 
-def unit_of(message: Any) -> float:
+def depth_unit_of(message: Any) -> float:
     """Meters per count of a depth picture: REP 118 says meters for floats, else millimeters."""
     encoding = message.format if hasattr(message, "format") else message.encoding
     return 1.0 if encoding.startswith("32FC1") else 0.001
@@ -81,7 +81,7 @@ def stamp_s(message: Any) -> float | None:
     return time_s or None
 
 
-def camera_of(info: Any, topic: str) -> Intrinsics | None:
+def intrinsics_of(info: Any, topic: str) -> Intrinsics | None:
     """Intrinsics of a CameraInfo, for pictures of a topic; None for a camera that was not calibrated."""
     K, D, P = (np.asarray(getattr(info, k, getattr(info, k.lower(), ()))) for k in "KDP")
     size = {"width": info.width, "height": info.height}
@@ -94,7 +94,7 @@ def camera_of(info: Any, topic: str) -> Intrinsics | None:
     return Intrinsics.from_matrix(K.reshape(3, 3), distortion=tuple(known.tolist()) if known.any() else (), **size)
 
 
-def flatten(message: Any) -> list[float]:
+def message_numbers(message: Any) -> list[float]:
     """The numbers of a message in their order, its header left out; of a JointState the positions."""
     if hasattr(message, "position") and hasattr(message, "effort"):
         return list(np.asarray(message.position, float))
@@ -108,7 +108,7 @@ def flatten(message: Any) -> list[float]:
         elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
             numbers.extend(value.astype(float).ravel().tolist())
         elif hasattr(value, "__dataclass_fields__"):
-            numbers.extend(flatten(value))
+            numbers.extend(message_numbers(value))
     return numbers
 
 

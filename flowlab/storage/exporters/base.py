@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from flowlab.config import Settings, explain, override
 from flowlab.errors import DataError, UsageError
 from flowlab.registry import EXPORTERS
-from flowlab.storage.dataset import Dataset, EpisodeRef
+from flowlab.storage.dataset import Dataset
+from flowlab.storage.episodes import EpisodeRef
 
 
 class Exporter(Settings, ABC):

@@ -5,7 +5,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int8, UInt8
+from jaxtyping import Float, Float32, Float64, Int8, Num, UInt8
 
 from flowlab.records import Clip
 from flowlab.tracking.trackers.rigid_bodies import _surfaces
@@ -44,17 +44,17 @@ class ClipFeatures:
         """The lightness of a frame, 0 to 255."""
         return self.feature[t, :, :, 1].astype(np.float32)
 
-    def unproject(self, uv: np.ndarray, z: np.ndarray) -> Float64[np.ndarray, "*n 3"]:
-        """Points [m] in the camera frame at pixels (n, 2) and depths (n,) [m]."""
+    def unproject(self, uv: Num[np.ndarray, "*n 2"], z: Num[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n 3"]:
+        """Points [m] in the camera frame at pixels of these pictures and z-depths [m]."""
         x = (uv - self.K[:2, 2]) / [self.K[0, 0], self.K[1, 1]] * z[..., None]
         return np.concatenate([x, z[..., None]], -1)
 
-    def project(self, xyz_cam: np.ndarray) -> Float64[np.ndarray, "*n 2"]:
+    def project(self, xyz_cam: Float[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 2"]:
         """Pixels of points in the camera frame."""
         z = np.maximum(xyz_cam[..., 2:], 1e-6)
         return xyz_cam[..., :2] / z * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
 
-    def from_clip_pixels(self, uv: np.ndarray) -> np.ndarray:
+    def from_clip_pixels(self, uv: Num[np.ndarray, "*n 2"]) -> Num[np.ndarray, "*n 2"]:
         """Pixels of the clip as pixels of these pictures."""
         return (uv - self.offset) / self.factor
 
@@ -63,13 +63,18 @@ class ClipFeatures:
         """The longer side [px] of the clip's pictures, but for what shrinking cut off."""
         return self.factor * max(self.depth.shape[1:])
 
-    def to_clip_pixels(self, uv: np.ndarray) -> np.ndarray:
+    def to_clip_pixels(self, uv: Num[np.ndarray, "*n 2"]) -> Num[np.ndarray, "*n 2"]:
         """The inverse of :meth:`from_clip_pixels`."""
         return uv * self.factor + self.offset
 
 
 def extract_features(clip: Clip, max_depth: float) -> ClipFeatures:
-    """The frames of a clip, shrunk; depth beyond ``max_depth`` [m] counts as missing."""
+    """The frames of a clip, made ready for the fit.
+
+    Args:
+        clip: The pictures; they are shrunk by a whole factor where they are much wider than ``WIDTH``.
+        max_depth: Depth beyond this [m] counts as missing.
+    """
     factor = max(1, round(clip.camera.width / WIDTH))
     offset = (factor - 1) // 2
     K = clip.camera.K.astype(float).copy()

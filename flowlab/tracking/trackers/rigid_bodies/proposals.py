@@ -5,7 +5,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, Num
 from scipy.spatial import cKDTree
 
 from flowlab.tracking.trackers.rigid_bodies._costs import inlier_shares
@@ -41,7 +41,9 @@ class Trajectories:
     known: Bool[np.ndarray, "T n"]
 
 
-def flow(pictures: ClipFeatures, t: int, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def flow(
+    pictures: ClipFeatures, t: int, uv: Num[np.ndarray, "n 2"]
+) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
     """Where pixels (n, 2) of frame t - 1 are in frame t, and which of them come back when followed back."""
     before, after = (pictures.feature[k, :, :, 1].copy() for k in (t - 1, t))
     p = np.ascontiguousarray(uv, np.float32)

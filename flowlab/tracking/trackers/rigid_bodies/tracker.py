@@ -4,7 +4,7 @@ from dataclasses import fields
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from pydantic import Field
 
 from flowlab.records import Clip, Tracks2D
@@ -79,7 +79,7 @@ class RigidBodiesSession:
         return tracks
 
 
-def depth_at(depth: Float32[np.ndarray, "H W"], xy: np.ndarray) -> Float32[np.ndarray, "M"]:
+def depth_at(depth: Float32[np.ndarray, "H W"], xy: Float[np.ndarray, "M 2"]) -> Float32[np.ndarray, "M"]:
     """The reading [m] at the pixel nearest to each point (M, 2); 0 where there is none."""
     column, row = np.rint(xy).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])

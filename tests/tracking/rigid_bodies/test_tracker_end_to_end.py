@@ -5,8 +5,6 @@ from dataclasses import fields
 import moving_planes
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from flowlab.geometry.sampling import farthest_points
@@ -15,9 +13,8 @@ from flowlab.testing.trackers import check_tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.labeling import label_clip
 from flowlab.tracking.lifting import LiftSettings
-from flowlab.tracking.trackers.rigid_bodies import RigidBodies, _costs, _gauss_newton, _surfaces
+from flowlab.tracking.trackers.rigid_bodies import RigidBodies
 from flowlab.tracking.trackers.rigid_bodies.features import extract_features
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, fit_rigid
 
 FRAMES = 24
 
@@ -122,15 +119,6 @@ def test_large_pictures_are_shrunk_and_give_the_same_places() -> None:
     assert np.median(error, 1).max() < 0.004
 
 
-def test_own_pixels_and_the_clips_are_inverse_and_mean_the_same_ray() -> None:
-    clip, _ = moving_planes.film(two_plates(), width=960, height=720)
-    pictures = extract_features(Clip(clip.rgb[:2], clip.depth[:2], clip.camera), 4.0)
-    uv = np.array([[100.0, 200.0], [3.5, 7.25]])
-    np.testing.assert_allclose(pictures.to_clip_pixels(pictures.from_clip_pixels(uv)), uv)
-    z = np.array([1.0, 2.0])
-    np.testing.assert_allclose(pictures.unproject(pictures.from_clip_pixels(uv), z), clip.camera.unproject(uv, z))
-
-
 def test_points_without_depth_are_followed_in_the_picture() -> None:
     scene = two_plates()
     clip, owner = moving_planes.film(scene)
@@ -165,76 +153,3 @@ def test_same_seed_same_tracks() -> None:
 
 def test_keeps_the_contract_of_trackers() -> None:
     check_tracker(RigidBodies)
-
-
-@given(
-    rotation=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
-    t=st.lists(st.floats(-1, 1), min_size=3, max_size=3),
-    outliers=st.integers(0, 4),
-    seed=st.integers(0, 99),
-)
-def test_best_rigid_finds_the_motion_despite_outliers(
-    rotation: list[float], t: list[float], outliers: int, seed: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    a = rng.normal(0, 0.1, (30, 3))
-    R = Rotation.from_rotvec(rotation).as_matrix()
-    b = a @ R.T + t
-    b[:outliers] += rng.normal(0, 0.02, (outliers, 3))
-    R_found, t_found = fit_rigid(a, b, np.ones(30), refinements=12)
-    np.testing.assert_allclose(R_found, R, atol=0.02)
-    np.testing.assert_allclose(t_found, t, atol=0.002)
-    assert np.linalg.det(R_found) == pytest.approx(1)
-
-
-def test_best_rigid_agrees_with_scipy() -> None:
-    rng = np.random.default_rng(0)
-    a, b, w = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.uniform(0.1, 1, 20)
-    R, t = fit_rigid(a, b, w, refinements=0)
-    mean_a, mean_b = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
-    expected = Rotation.align_vectors(b - mean_b, a - mean_a, weights=w)[0].as_matrix()
-    np.testing.assert_allclose(R, expected, atol=1e-8)
-    np.testing.assert_allclose(t, mean_b - expected @ mean_a, atol=1e-8)
-
-
-def test_a_motion_carries_points() -> None:
-    R = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_matrix()
-    motion = RigidMotion(R, np.array([[0, 0, 0], [1.0, 0, 0]]))
-    np.testing.assert_allclose(motion.apply(np.array([[1.0, 0, 2.0]]))[:, 0], [[1, 0, 2], [1, 1, 2]], atol=1e-12)
-
-
-def test_normals_of_a_tilted_plane() -> None:
-    normal = np.array([0.3, -0.2, -1.0])
-    normal /= np.linalg.norm(normal)
-    K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
-    v, u = np.mgrid[:120, :160]
-    rays = np.stack([(u - 79.5) / 150, (v - 59.5) / 150, np.ones_like(u, float)], -1)
-    depth = (normal @ [0, 0, 0.8] / (rays @ normal)).astype(np.float32)
-    found = _surfaces.surface_normals(depth, K) / 127
-    np.testing.assert_allclose(np.abs(found[10:-10, 10:-10] @ normal), 1, atol=0.02)
-
-
-def test_alignment_mends_a_wrong_pose_and_the_energy_says_so() -> None:
-    scene = two_plates()
-    clip, owner = moving_planes.film(scene)
-    pictures = extract_features(clip, 4.0)
-    uv = queries(owner, 1, count=200, border=3).astype(int)
-    points = pictures.unproject(uv.astype(float), pictures.smooth[0, uv[:, 1], uv[:, 0]].astype(float))[None]
-    features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))[None]
-    t = 10
-    plate = scene[1]
-    R_true = plate.R[t] @ plate.R[0].T
-    s_true = plate.t[t] - R_true @ plate.t[0]
-    off = Rotation.from_rotvec([0.01, -0.01, 0.02]).as_matrix() @ R_true, s_true + np.array([0.004, -0.003, 0.003])
-    R, s = _gauss_newton.align(
-        points, features[..., 1].astype(float), off[0][None], off[1][None], pictures.lightness(t), pictures.smooth[t],
-        pictures.normal[t], pictures.K, 10,
-    )  # fmt: skip
-    moved = (np.linalg.norm(points[0] @ (Q - R_true).T + (x - s_true), axis=1).mean() for Q, x in [(R[0], s[0]), off])
-    after, before = moved
-    assert after < 0.001
-    assert after < 0.2 * before
-    candidates = np.stack([R_true, off[0], np.eye(3)])[None], np.stack([s_true, off[1], np.zeros(3)])[None]
-    energy, seen = _costs.energies(points, features, *candidates, pictures.depth[t], pictures.feature[t], pictures.K, 1)
-    assert energy[0].argmin() == 0
-    assert seen[0, 0] > 0.95

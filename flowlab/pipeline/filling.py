@@ -1,0 +1,124 @@
+"""Fill a dataset by a recipe: run planned units on an engine, and keep the books."""
+
+import errno
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+from flowlab.engines.base import Engine, StartEngine, UnitResult, engine_by_name
+from flowlab.errors import FlowlabError, MissingFileError, UnfinishedError
+from flowlab.pipeline.recipe import Recipe
+from flowlab.pipeline.scheduling import ExtractionProgress, UnitScheduler
+from flowlab.pipeline.units import JobShard, WorkUnit
+from flowlab.pipeline.worker import run_unit
+from flowlab.storage.dataset import Dataset, begin, summarize
+from flowlab.storage.manifest import Manifest, Receipt, read_receipts
+
+_SECONDS_BETWEEN_SUMMARIES = 5.0
+
+
+def engine_for(recipe: Recipe, engine: str, workers: int | None) -> StartEngine[WorkUnit, Receipt]:
+    """What makes an engine for the units of a recipe. Raises :class:`UsageError` where there is none of that name."""
+    stages = [type(s).__module__ for s in recipe.stages if ":" not in s.stage]
+    return engine_by_name(engine, workers, ["flowlab.pipeline.worker", *dict.fromkeys(stages)])
+
+
+def fill(
+    recipe: Recipe,
+    manifest: Manifest,
+    plan_for: Callable[[Manifest], UnitScheduler],
+    folder: Path,
+    *,
+    start_engine: StartEngine[WorkUnit, Receipt],
+    share: JobShard,
+    report: Callable[[ExtractionProgress], None],
+) -> Dataset:
+    """Run a plan, made for the manifest as it is on disk, until there is nothing left of it, and keep the books.
+
+    Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
+    the dataset is whole in either case.
+    """
+    log = folder / "failures.log"
+    try:
+        manifest = begin(folder, manifest)
+        log.unlink(missing_ok=True)
+    except MissingFileError:
+        raise
+    except OSError as error:
+        raise _storage_error(folder, error) from error
+    work = partial(run_unit, recipe.model_dump_json(), recipe.folder, manifest.settings_digest, folder)
+    try:
+        with start_engine(work) as engine:
+            failures = run_all(engine, plan_for(manifest), folder, share, report)
+        dataset = summarize(folder)
+    except MissingFileError:
+        raise
+    except OSError as error:
+        raise _storage_error(folder, error) from error
+    except BaseException:
+        with suppress(OSError):  # what ended the run is what the user must hear of
+            summarize(folder)
+        raise
+    if failures:
+        log.write_text("\n\n".join(f"{f.unit.name}\n{f.failure}" for f in failures))
+        last = failures[0].failure.strip().split("\n")[-1]
+        raise UnfinishedError(
+            f"{len(failures)} units failed, the first ({failures[0].unit.name}) with: {last}. "
+            f"All are in {log}; the same command tries them again"
+        )
+    return dataset
+
+
+def run_all(
+    engine: Engine[WorkUnit, Receipt],
+    plan: UnitScheduler,
+    folder: Path,
+    share: JobShard,
+    report: Callable[[ExtractionProgress], None],
+) -> list[UnitResult[WorkUnit, Receipt]]:
+    """Submit units and collect outcomes until nothing is left that this run could do; returns the failures."""
+    receipts = _receipts_by_unit(folder)
+    under_way: dict[str, WorkUnit] = {}
+    failures: list[UnitResult[WorkUnit, Receipt]] = []
+    next_summary = time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
+    while True:
+        taken = [*under_way.values(), *(f.unit for f in failures)]
+        for unit in plan.next_units(receipts.values(), taken, share):
+            under_way[unit.name] = unit
+            engine.submit(unit)
+        report(plan.progress(receipts.values()))
+        if not under_way:
+            seen, receipts = receipts.keys(), _receipts_by_unit(folder)
+            if receipts.keys() == seen:  # otherwise jobs beside this one went on: is there more to do now?
+                return failures
+            continue
+        outcome = engine.next_result()
+        del under_way[outcome.unit.name]
+        if outcome.receipt is None:
+            failures.append(outcome)
+        else:
+            receipts[outcome.unit.name] = outcome.receipt
+        if time.monotonic() > next_summary:
+            start = time.monotonic()
+            summarize(folder)
+            next_summary = time.monotonic() + max(_SECONDS_BETWEEN_SUMMARIES, 20 * (time.monotonic() - start))
+
+
+def _receipts_by_unit(folder: Path) -> dict[str, Receipt]:
+    return {r.unit: r for r in read_receipts(folder)}
+
+
+def _storage_error(folder: Path, error: OSError) -> FlowlabError:
+    """The sentence for a disk that will not take more."""
+    causes = {
+        errno.ENOSPC: "no space is left on its disk; free some",
+        errno.EDQUOT: "your disk quota is used up; free some space",
+        errno.EACCES: "writing is not permitted; change its permissions",
+        errno.EROFS: "it is on a read-only disk; move it",
+    }
+    cause = causes.get(error.errno or 0, f"{error.strerror or error}; see to it")
+    return FlowlabError(
+        f"{folder}: {cause}, then run the same command again: what was finished is kept, and it does the rest"
+    )

@@ -1,0 +1,163 @@
+"""How badly a motion explains pictures: zero where it is right, and as bad as it says where it is not."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rigid_body_scenes import FRAMES, two_plates
+from scipy.spatial.transform import Rotation
+
+from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
+
+rng = np.random.default_rng(0)
+FEATURE = rng.integers(0, 256, (20, 30, 4), np.uint8)
+
+
+@given(u=st.floats(0, 28.9), v=st.floats(0, 18.9))
+def test_features_are_interpolated(u: float, v: float) -> None:
+    (found,) = _costs.features_at(FEATURE, np.array([[u, v]], np.float32))
+    u, v = np.float32(u), np.float32(v)
+    j, i = int(u), int(v)
+    across = (1 - (u - j)) * FEATURE[i : i + 2, j].astype(float) + (u - j) * FEATURE[i : i + 2, j + 1]
+    np.testing.assert_allclose(found, (1 - (v - i)) * across[0] + (v - i) * across[1], atol=1e-3)
+    assert _costs.color_cost(FEATURE, float(u), float(v), found) < 1e-3
+
+
+def test_a_difference_of_color_costs_what_its_channels_say_and_at_most_1() -> None:
+    at = FEATURE[5, 7].astype(np.float32)
+    one = _costs.color_cost(FEATURE, 7.0, 5.0, at + np.float32([0, 7, 0, 0]))
+    assert one == pytest.approx(7 * _costs.L)
+    all_four = _costs.color_cost(FEATURE, 7.0, 5.0, at + np.float32([4, -7, 3, -3]))
+    assert all_four == pytest.approx(4 * _costs.LCN + 7 * _costs.L + 3 * _costs.A + 3 * _costs.B)
+    assert _costs.color_cost(FEATURE, 7.0, 5.0, at + 1000) == 1
+
+
+def test_the_nearest_reading_is_that_of_the_layer_meant() -> None:
+    depth = np.zeros((5, 5), np.float32)
+    depth[1, 1], depth[2, 3], depth[3, 3] = 0.7, 0.9, 1.2
+    off, least, greatest = _costs.nearest_reading(depth, 2.0, 2.0, 1.25)
+    assert (off, least, greatest) == pytest.approx((0.05, 0.7, 1.2))
+    depth[2, 2] = 1.0
+    assert _costs.nearest_reading(depth, 2.2, 1.9, 0.97)[0] == pytest.approx(0.03)  # the center's own counts too
+    assert _costs.nearest_reading(np.zeros((5, 5), np.float32), 2.0, 2.0, 1.0)[2] == 0
+
+
+def test_energy_is_least_where_the_body_is_and_tells_free_space_from_what_hides() -> None:
+    scene, t = two_plates(), 10
+    uv = scene.some_pixels(1, 200)
+    features = _costs.features_at(scene.pictures.feature[0], uv.astype(np.float32))
+    motion, points = scene.motion(1), scene.points(uv)
+    near, far = (points + np.array([0, 0, z]) for z in (-0.15, 0.15))
+    R = np.stack([motion.R[t], motion.R[t], np.eye(3)])
+    s = np.stack([motion.t[t], motion.t[t] + np.array([0.02, 0, 0]), np.zeros(3)])
+    p = scene.pictures
+
+    def energies(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        energy, seen = _costs.energies(xyz[None], features[None], R[None], s[None], p.depth[t], p.feature[t], p.K, 1)
+        return energy[0], seen[0]
+
+    energy, seen = energies(points)
+    assert energy.argmin() == 0
+    assert energy[0] < 0.25
+    assert seen[0] > 0.95
+    assert energies(near)[0][0] == pytest.approx(_costs.SEEN_BEHIND), "the camera looks through where it would be"
+    assert energies(far)[0][0] == pytest.approx(_costs.HIDDEN), "the plate hides where it would be"
+    assert energies(near)[1][0] == energies(far)[1][0] == 0
+    behind, _ = energies(points - [0, 0, 5.0])
+    np.testing.assert_allclose(behind, _costs.HIDDEN)
+
+
+def test_every_nth_point_may_be_looked_at() -> None:
+    scene, t = two_plates(), 10
+    uv = scene.some_pixels(1, 300)
+    points, p = scene.points(uv), scene.pictures
+    features = _costs.features_at(p.feature[0], uv.astype(np.float32))
+    R, s = np.eye(3)[None, None], np.zeros((1, 1, 3))
+    thinned = _costs.energies(points[None], features[None], R, s, p.depth[t], p.feature[t], p.K, 3)
+    chosen = _costs.energies(points[None, ::3], features[None, ::3], R, s, p.depth[t], p.feature[t], p.K, 1)
+    np.testing.assert_allclose(thinned, chosen, rtol=1e-6)
+
+
+def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:
+    scene = two_plates()
+    motions = [scene.motion(k) for k in range(3)]
+    R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
+    p, frames = scene.pictures, np.arange(1, FRAMES)
+    for k in range(3):
+        uv = scene.some_pixels(k, 100)
+        features = _costs.features_at(p.feature[0], uv.astype(np.float32))
+        cost, moved = _costs.motion_costs(scene.points(uv), features, frames, R, t, p.depth, p.feature, p.K)
+        assert (cost.argmin(0) == k).mean() > 0.9, k
+        path = np.stack([m.apply(scene.points(uv)) for m in motions])
+        away = np.linalg.norm(path[:, 1:] - path[:, :1], axis=-1) > 0.01
+        np.testing.assert_allclose(moved, away.mean(1), atol=1.01 / len(frames))  # at the limit, rounding decides
+
+
+def test_what_fits_leaves_no_residual_and_without_depth_none_is_known() -> None:
+    scene = two_plates()
+    uv = scene.some_pixels(1, 100)
+    path = scene.motion(1).apply(scene.points(uv))
+    p = scene.pictures
+    features = _costs.features_at(p.feature[0], uv.astype(np.float32))
+    pixels, z = p.project(path), path[..., 2]
+    found = _costs.residuals(p.depth, p.feature, features, pixels, z)
+    assert np.median(found) < 0.2
+    off = _costs.residuals(p.depth, p.feature, features, pixels, z + 0.1)
+    np.testing.assert_allclose(off - found, 0.3, atol=0.16)
+    none = _costs.residuals(np.zeros_like(p.depth), p.feature, features, pixels, z)
+    np.testing.assert_array_equal(none, -1)
+
+
+def test_inliers_are_counted_over_known_frames() -> None:
+    start = rng.normal(size=(5, 3))
+    R = Rotation.from_rotvec(rng.normal(size=(8, 3))).as_matrix()
+    t = rng.normal(size=(8, 3))
+    path = np.einsum("fij,nj->fni", R, start) + t[:, None]
+    known = np.ones((8, 5), bool)
+    path[:4, 1] += 0.02  # off in half of the frames
+    path[:, 2] += 0.02
+    known[4:, 2] = known[:, 3] = False
+    path[2, 4] += 0.02
+    known[2, 4] = False
+    found = _costs.inlier_shares(R, t, start, path, known, np.full((8, 5), 0.01))
+    np.testing.assert_allclose(found, [1, 0.5, 0, 0, 1])
+
+
+def test_a_point_is_seen_where_its_depth_is_read_or_nothing_is() -> None:
+    depth = np.full((1, 20, 30), 1.0, np.float32)
+    depth[0, :, 15:] = 0.7
+    depth[0, 10:, :] = 0
+    uv = np.array([[[5.0, 5], [5, 5], [20, 5], [15, 5], [5, 15]]])
+    z = np.array([[1.005, 1.05, 1.0, 1.0, 1.0]])
+    #             here,  behind, hidden, hidden but for its neighbor, a hole
+    np.testing.assert_array_equal(_surfaces.is_seen(depth, uv, z), [[True, False, False, True, True]])
+
+
+def test_how_far_beyond_points_the_surface_is_read() -> None:
+    depth = np.full((1, 20, 30), 1.0, np.float32)
+    depth[0, :, 15:] = 0.7
+    uv, z = np.array([[[5.0, 5], [14, 5], [20, 5]]]), np.array([[0.997, 0.998, 1.0]])
+    found = _surfaces.depth_offsets(depth, uv, z)
+    np.testing.assert_allclose(found[0, :2], [0.003, 0.002], atol=1e-6)
+    assert np.isnan(found[0, 2])
+
+
+def test_costs_are_averaged_over_neighbors_that_look_alike_only() -> None:
+    h, w = 12, 16
+    cost = rng.random((2, h, w)).astype(np.float32)
+    depth, feature = np.full((h, w), 1.0, np.float32), np.zeros((h, w, 4), np.uint8)
+    depth[:, 8:] = 1.5
+    feature[6:, :, 1] = 255
+    valid, wanted = np.ones((h, w), bool), np.ones((h, w), bool)
+    valid[0, 0] = wanted[1, 1] = False
+    out = _surfaces.aggregate(cost, wanted, valid, depth, feature, 3, 0.01, 0.35, 2.0)
+    assert np.isinf(out[:, 0, 0]).all()
+    np.testing.assert_array_equal(out[:, 1, 1], cost[:, 1, 1])
+    far = cost.copy()
+    far[:, :, 8:] += 5
+    far[:, 6:] += 7
+    again = _surfaces.aggregate(far, wanted, valid, depth, feature, 3, 0.01, 0.35, 2.0)
+    np.testing.assert_allclose(again[:, 1:6, :8], out[:, 1:6, :8], atol=0.02)
+    assert out[:, 2:6, :8].std() < 0.5 * cost[:, 2:6, :8].std()
+    same = _surfaces.aggregate(np.full_like(cost, 0.4), wanted, valid, depth, feature, 3, 0.01, 0.35, 2.0)
+    np.testing.assert_allclose(same[:, valid], 0.4, rtol=1e-6)
