@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -63,6 +63,7 @@ class Streams:
     """What a user should know, a sentence each."""
 
 
+@runtime_checkable
 class Reader(Protocol):
     """Reads one layout of recordings. A reader has no settings: its class is called without arguments."""
 

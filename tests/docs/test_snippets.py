@@ -10,7 +10,7 @@ from test_docs import ROOT, blocks
 from trained_runs import NETWORK
 
 SMALLER = {
-    "minutes=5": f"settings={[*NETWORK, 'run.steps=4', 'run.validations=1', 'run.checkpoints=1']}",
+    "minutes=5": f"profile={str(NETWORK)!r}, settings=['run.minutes=null', 'run.steps=4', 'run.checkpoints=1']",
     "seeds=(0, 1, 2), episodes=20": "seeds=(0,), episodes=1, workers=1",
     "episodes=5": "episodes=3, workers=1",
     'tracker="lucas-kanade"': 'tracker="lucas-kanade", workers=1',
