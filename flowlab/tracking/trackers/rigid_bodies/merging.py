@@ -56,7 +56,7 @@ def neighbors(fit: RigidBodyFit) -> list[tuple[int, int]]:
         touch = (a > 0) & (b > 0) & (a != b) & (np.abs(z[near] - z[far]) < 0.03)
         np.add.at(border, (a[touch], b[touch]), 1)
     border = np.triu(border + border.T)
-    pairs = [(int(a), int(b)) for a, b in np.argwhere(border >= 2) if _move_alike(fit, owner, a, b)]
+    pairs = [(a, b) for a, b in np.argwhere(border >= 2).tolist() if _move_alike(fit, owner, a, b)]
     return sorted(pairs, key=lambda p: -border[p])
 
 
