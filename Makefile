@@ -51,7 +51,7 @@ clean: ## remove environments and everything made by the targets above
 .venv/run: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(PIP) install -c constraints.txt pip
-	$(PIP) install -c constraints.txt -e .
+	$(PIP) install --no-compile -c constraints.txt -e . # what is used is compiled when it is first imported
 	@touch $@
 
 # Simulated cameras see color through OpenGL. As root on Debian it is installed; else `flowlab grade` says what to do.

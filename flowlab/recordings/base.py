@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -63,6 +63,7 @@ class Streams:
     """What a user should know, a sentence each."""
 
 
+@runtime_checkable
 class Reader(Protocol):
     """Reads one layout of recordings. A reader has no settings: its class is called without arguments."""
 
@@ -152,6 +153,7 @@ def expected_layouts(readers: tuple[Reader, ...]) -> str:
 
 
 def _load_installed(plugin: Plugin) -> Reader | None:
+    """A reader; None where that of another package cannot be used, of which a warning is given."""
     try:
         reader: Reader = READERS.load(plugin.name)()
         return reader
@@ -166,4 +168,5 @@ def _load_installed(plugin: Plugin) -> Reader | None:
 
 @cache
 def _warn_once(sentence: str) -> None:
+    """Log a warning the first time."""
     _LOG.warning("flowlab: %s", sentence)
