@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -14,6 +14,7 @@ from flowlab.records import Clip, Tracks2D
 from flowlab.registry import TRACKERS
 
 
+@runtime_checkable
 class Session(Protocol):
     """One clip, opened by a tracker: whatever is made once per frame is made here, once."""
 
