@@ -57,7 +57,9 @@ class Frame(Record):
     rgb: UInt8[np.ndarray, "H W 3"] | None = None
 
     def _check_values(self) -> None:
-        if (self.depth < 0).any():
+        if not self.depth.size or self.depth.min() >= 0:
+            return
+        if (self.depth < 0).any():  # and not only NaN
             v, u = np.argwhere(self.depth < 0)[0]
             raise self._wrong("depth", f"is {self.depth[v, u]:g} m at pixel ({u}, {v}), expected 0 or more")
 

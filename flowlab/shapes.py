@@ -37,17 +37,44 @@ class Record:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        self.sizes()
+        if self._fitting() is None:
+            self.sizes()  # says what is wrong
         self._check_values()
 
     def __repr__(self) -> str:
         shown = [f"{f.name}={_short(value)}" for f in fields(self) if not _is_nothing(value := getattr(self, f.name))]  # type: ignore[arg-type]
         return f"{type(self).__name__}({', '.join(shown)})"
 
+    def lengths(self) -> dict[str | int, int]:
+        """Length of every dimension, by its name."""
+        return self._fitting() or {}
+
+    def _fitting(self) -> dict[str | int, int] | None:
+        """Those lengths; None where anything may be wrong. Quick, for records are made at every step."""
+        arrays, inner, fixed = _declared(type(self))  # type: ignore[arg-type]
+        found = dict(fixed)
+        for name in inner:
+            value = getattr(self, name)
+            for dim, length in value.lengths().items() if isinstance(value, Record) else ():
+                if found.setdefault(dim, length) != length:
+                    return None
+        for array in arrays:
+            value = getattr(self, array.name)
+            if value is None and array.optional:
+                continue
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in array.kinds:
+                return None
+            if value.ndim != len(array.dims):
+                return None
+            for dim, length in zip(array.dims, value.shape, strict=False):
+                if found.setdefault(dim, length) != length:
+                    return None
+        return found
+
     def sizes(self) -> dict[str, Size]:
         """Length of every named dimension. Raises :class:`RecordError` where arrays do not agree."""
         found: dict[str, Size] = {}
-        declared, inner = _declared(type(self))  # type: ignore[arg-type]
+        declared, inner, _ = _declared(type(self))  # type: ignore[arg-type]
         for name in inner:
             value = getattr(self, name)
             if isinstance(value, Record):
@@ -99,12 +126,13 @@ class _Array:
 
 
 @cache
-def _declared(cls: type) -> tuple[tuple[_Array, ...], tuple[str, ...]]:
-    """The arrays of a record, and the names of the records in it."""
+def _declared(cls: type) -> tuple[tuple[_Array, ...], tuple[str, ...], dict[str | int, int]]:
+    """The arrays of a record, the names of the records in it, and the dimensions whose name is their length."""
     hints = get_type_hints(cls)
     names = [f.name for f in fields(cls)]
     arrays = tuple(array for name in names if (array := _array(name, hints[name])) is not None)
-    return arrays, tuple(name for name in names if _is_record(hints[name]))
+    fixed: dict[str | int, int] = {dim: dim for array in arrays for dim in array.dims if isinstance(dim, int)}
+    return arrays, tuple(name for name in names if _is_record(hints[name])), fixed
 
 
 def _array(name: str, hint: Any) -> _Array | None:

@@ -16,7 +16,7 @@ from flowlab.errors import UsageError
 @click.option("--task", "tasks", multiple=True, help="May be repeated  [all that every policy was trained on].")
 @click.option("--execute", type=click.IntRange(min=1), help="Steps of a plan to execute: 1 or 8, say  [the policy's].")
 @click.option("--checkpoints", is_flag=True, help="Evaluate every checkpoint of the runs: a learning curve.")
-@click.option("--engine", default="local", show_default=True, help="What runs the workers: see flowlab plugins.")
+@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes  [one for each core].")
 @click.option("--device", default="cpu", show_default=True, help="Where plans are made: cpu, cuda, cuda:1.")
 @click.option("--films", type=click.IntRange(min=0), default=0, metavar="N", help="Film N successes and N failures.")

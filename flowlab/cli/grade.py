@@ -89,6 +89,7 @@ def grade(
 
 
 def _size(text: str) -> tuple[int, int]:
+    """Width and height of ``320x240``."""
     width, times, height = text.partition("x")
     if not (times and width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
         raise UsageError(f"--size {text}: must look like 320x240")
@@ -128,11 +129,13 @@ def _print(results: Sequence["TrackerGrade"]) -> None:
 
 
 def _error_figures(errors: "TrackErrors") -> list[object]:
+    """Errors in mm and shares, rounded for a table."""
     shares = errors.within_5mm, errors.within_10mm, errors.within_20mm, errors.within_40mm
     return [round(errors.median_mm, 1), round(errors.p95_mm, 1), *(round(s, 2) for s in shares)]
 
 
 def _summary(grades: "TrackerGrade") -> list[object]:
+    """A tracker's row in the table of TAPVid-3D's figures and stated errors."""
     t, c = grades.mean.tapvid, grades.mean.calibration
     sigma = ["-"] * 3 if c is None else [_share(x) for x in (c.within_1_sigma, c.within_2_sigma, c.rank_correlation)]
     figures = [_share(x) for x in (t.average_jaccard, t.apd, t.occlusion_accuracy, grades.mean.survival)]
@@ -140,6 +143,7 @@ def _summary(grades: "TrackerGrade") -> list[object]:
 
 
 def _row(tracker: str, grade: "RecordingGrade") -> list[object]:
+    """A recording's row."""
     m, t = grade.metrics, grade.metrics.tapvid
     visible = "-" if m.all is None else round(m.all.median_mm, 1)
     moved = ["-", "-"] if m.moving is None else [round(m.moving.median_mm, 1), round(m.moving.within_20mm, 2)]
@@ -147,4 +151,5 @@ def _row(tracker: str, grade: "RecordingGrade") -> list[object]:
 
 
 def _share(value: float) -> object:
+    """A share, rounded for a table; a dash where it is no number."""
     return round(value, 3) if value == value else "-"

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from flowlab.config import Settings
@@ -17,6 +18,9 @@ from flowlab.data.source import TrainingSource
 _STILL = 1e-4
 """A channel that varies less than this is only centered, as in DP3."""
 
+Limits = Sequence[float] | Float[np.ndarray, "C"]
+"""Least or greatest value of every channel."""
+
 
 class Scale(Settings):
     """``normal = (value - offset) / unit``, channel by channel."""
@@ -25,7 +29,7 @@ class Scale(Settings):
     unit: tuple[float, ...]
 
     @classmethod
-    def of_limits(cls, low: Sequence[float], high: Sequence[float]) -> "Scale":
+    def of_limits(cls, low: Limits, high: Limits) -> "Scale":
         """Brings ``low`` to -1 and ``high`` to 1."""
         lo, hi = np.array(low), np.array(high)
         unit = np.where(hi - lo < _STILL, 1.0, (hi - lo) / 2)
@@ -69,7 +73,7 @@ def fit_normalizer(
     )
 
 
-def _isotropic(scale: Scale, limits: tuple[Sequence[float], Sequence[float]], channels: tuple[int, int, int]) -> Scale:
+def _isotropic(scale: Scale, limits: tuple[Limits, Limits], channels: tuple[int, int, int]) -> Scale:
     """A scale whose ``channels`` have one unit and no offset, so that a turned displacement is in range, too."""
     offset, unit = np.array(scale.offset), np.array(scale.unit)
     offset[list(channels)] = 0
@@ -90,7 +94,7 @@ def _flow_scale(statistics: Mapping[str, Any], needs: FlowNeeds | None) -> tuple
 
 def _relative_limits(
     buffer: ReplayBuffer, channels: ChannelSpec, settings: TrainSettings
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Float[np.ndarray, "A"], Float[np.ndarray, "A"]]:
     """Limits of the actions of a window, where positions are given relative to the gripper when it is decided on."""
     assert channels.gripper is not None
     assert channels.action_position is not None

@@ -47,6 +47,9 @@ class Policy:
             seed: Of the noise of the first episode's plans.
             execute: How many steps of every plan are executed; by default as many as in training.
 
+        Returns:
+            The policy, before its first episode's first step.
+
         Raises:
             DataError: There is no policy, or it is damaged.
             UsageError: An argument does not fit it.

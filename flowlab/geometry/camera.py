@@ -29,6 +29,10 @@ class Camera(Record):
     T_world_cam: Float[np.ndarray, "4 4"]
     """Camera pose: maps camera coordinates to world coordinates [m]."""
 
+    def lengths(self) -> dict[str | int, int]:
+        """Of its pictures: height and width."""
+        return {"H": self.height, "W": self.width}
+
     def sizes(self) -> dict[str, Size]:
         """Of its pictures, too: height and width."""
         own = {"H": Size(self.height, "height"), "W": Size(self.width, "width")}

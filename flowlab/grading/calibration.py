@@ -55,5 +55,6 @@ def rank_correlation(a: Float[np.ndarray, "K"], b: Float[np.ndarray, "K"]) -> fl
 
 
 def _ranks(values: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+    """Ranks from 1, in the mean of their ranks where values are the same."""
     _, place, count = np.unique(values, return_inverse=True, return_counts=True)
     return (np.cumsum(count) - (count - 1) / 2)[place]

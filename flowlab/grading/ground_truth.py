@@ -109,6 +109,7 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> GroundTruth:
 
 
 def _check(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str) -> None:
+    """Refuse an array of another shape or kind of type, or with values that are not finite."""
     if values.shape != shape:
         raise DataError(f"{path}: '{name}' has the shape {values.shape}, expected {shape} as the other arrays say")
     if values.dtype.kind not in kinds:

@@ -128,6 +128,7 @@ def _motion(truth: GroundTruth) -> tuple[Bool[np.ndarray, "N"], Bool[np.ndarray,
 
 
 def _summary(error_m: Float[np.ndarray, "K"]) -> TrackErrors | None:
+    """The figures of a group of errors; None where there is none."""
     if len(error_m) == 0:
         return None
     error = error_m * 1e3
@@ -166,6 +167,7 @@ def _tapvid(
     camera: Camera,
     settings: MetricSettings,
 ) -> TapVid3D:
+    """The figures of the frames that count."""
     first = 0 if settings.count_query_frame else 1
     z = truth.tracks_cam[first:, :, 2].astype(np.float64)
     return tapvid(error_m[first:], stated_visible[first:], truth.visible[first:], z, camera, settings)
@@ -188,6 +190,7 @@ def _mean(values: Sequence[Any]) -> Any:
 
 
 def _json(value: Any) -> Any:
+    """A value as JSON has it."""
     if isinstance(value, float):
         return round(value, 6) if np.isfinite(value) else None
     if isinstance(value, tuple):

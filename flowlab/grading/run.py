@@ -153,6 +153,7 @@ def _simulate(
 
 
 def _import_mujoco() -> None:
+    """Import MuJoCo, which fails where it cannot load the OpenGL that is asked for."""
     try:
         import mujoco  # noqa: F401
     except Exception as error:
@@ -166,6 +167,7 @@ def _import_mujoco() -> None:
 
 @contextmanager
 def _writing(out: Path) -> Iterator[None]:
+    """Say where it was that something could not be written."""
     try:
         yield
     except OSError as error:

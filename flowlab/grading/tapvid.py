@@ -63,4 +63,5 @@ def _focal_px(camera: Camera, settings: MetricSettings) -> float:
 
 
 def _share(part: int, whole: int) -> float:
+    """A share; not a number of nothing."""
     return float(part / whole) if whole else float("nan")

@@ -80,6 +80,7 @@ def outlier_mask(xyz_world: Float[np.ndarray, "P 3"], settings: OutlierSettings)
 
 
 def _cloud(xyz_world: np.ndarray) -> Any:
+    """Points as Open3D's cloud."""
     open3d = _open3d()
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz_world.astype(np.float64)))
 

@@ -92,7 +92,7 @@ def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) ->
     """
     settings = recording_stage(recipe)
     found = []
-    for path in find_recordings(paths):
+    for path in find_recordings(paths, settings.reader):
         place = Path(os.path.abspath(path))
         name = task or _task_said(place, settings) or place.parent.name
         if not name or "/" in name or name.startswith("."):

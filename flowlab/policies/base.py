@@ -23,7 +23,7 @@ from flowlab.policies.settings import AnyTrainSettings
 from flowlab.registry import POLICIES
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
-"""Where the noise of plans comes from: a CPU generator for all windows, or one for each of them; None is torch's own."""
+"""Where the noise of plans comes from: a CPU generator for all windows, or one for each; None is torch's own."""
 
 
 class PolicySpec(Settings):
@@ -98,8 +98,8 @@ class PolicyNetwork(nn.Module, ABC):
         """
         if missing := settings.needs.missing_from(buffer):
             raise DataError(
-                f"{path}: has no {missing}, which {settings.policy} is trained on; make the dataset with them, or train "
-                "another policy: dp3 needs point clouds only"
+                f"{path}: has no {missing}, which {settings.policy} is trained on; make the dataset with them, or "
+                "train --policy dp3, which needs point clouds only"
             )
 
     def forward(self, batch: Batch, noise: NoiseSampler, windows: int) -> Losses:

@@ -21,7 +21,7 @@ from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, UsageError
 from flowlab.files import read_json, remove_leftovers, temporary_path, write_json
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
-from flowlab.policies.migrations import FORMAT, migrate_policy, migrate_tensor
+from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
 from flowlab.storage.manifest import differences
 from flowlab.version import __version__
 
@@ -106,7 +106,7 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     weights = path if path.suffix == ".safetensors" else newest_checkpoint(path)
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
-    tensors, step = _read(weights, _ADVICE)
+    tensors, step = _read(weights, folder, _ADVICE)
     policy = make_policy(trained.policy).requires_grad_(False).eval()
     try:
         policy.load_state_dict(tensors)
@@ -180,7 +180,7 @@ def read_resume(folder: Path) -> tuple[int, dict[str, dict[str, Tensor]]]:
     path = folder / RESUME
     if not path.exists():
         raise DataError(f"{folder}: nothing to resume (it has no {RESUME}); delete it and start anew")
-    tensors, step = _read(path, f"start anew; --from {folder} begins with its newest weights")
+    tensors, step = _read(path, folder, f"start anew; --from {folder} begins with its newest weights")
     groups: dict[str, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         group, _, rest = name.partition(":")
@@ -214,25 +214,23 @@ def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig) -> None:
 
 
 def _write(path: Path, tensors: Mapping[str, Tensor], step: int) -> None:
-    about = {"step": str(step), "format": str(FORMAT)}
     temporary = temporary_path(path)
     try:
         with writing_run(path.parent if path.name == RESUME else path.parents[1]):
-            save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, about)
+            save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, {"step": str(step)})
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def _read(path: Path, advice: str) -> tuple[dict[str, Tensor], int]:
-    """Tensors, and the step they are of."""
+def _read(path: Path, run: Path, advice: str) -> tuple[dict[str, Tensor], int]:
+    """Tensors of a run, and the step they are of."""
+    old = is_old(read_json(run / POLICY))
     with _understood(path, advice):
         with safetensors.safe_open(path, "pt") as file:
             about = file.metadata() or {}
         tensors, step = load_file(path), int(about["step"])
-        if int(about.get("format", 1)) < FORMAT:
-            tensors = {migrate_tensor(name): value for name, value in tensors.items()}
-        return tensors, step
+    return {migrate_tensor(name) if old else name: value for name, value in tensors.items()}, step
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 from flowlab.storage.migrations import migrate_observer
 
 FORMAT = 2
-"""Of ``policy.json`` and of files of weights."""
+"""Of ``policy.json``."""
 _SETTINGS = {"history": "n_obs_steps", "executed": "n_action_steps", "optimiser": "optimizer"}
 _SPEC = {"normaliser": "normalizer", "layout": "channels"}
 _CHANNELS = {"state_places": "state_positions", "action_place": "action_position"}
@@ -34,9 +34,14 @@ _TENSORS = (
 """Names of weights, old and new, as patterns and what stands in their place."""
 
 
+def is_old(values: Any) -> bool:
+    """Whether a ``policy.json`` is of format 1, and with it all weights beside it: a name of today is left as it is."""
+    return isinstance(values, dict) and values.get("format", 1) == 1
+
+
 def migrate_policy(values: Any) -> Any:
     """The values of a ``policy.json`` in today's format; anything else than one of format 1 is left as it is."""
-    if not isinstance(values, dict) or values.get("format", 1) != 1:
+    if not is_old(values):
         return values
     moved = _renamed(values, {"layouts": "scene_seeds"})
     if not isinstance(values.get("policy"), dict):

@@ -153,6 +153,7 @@ def expected_layouts(readers: tuple[Reader, ...]) -> str:
 
 
 def _load_installed(plugin: Plugin) -> Reader | None:
+    """A reader; None where that of another package cannot be used, of which a warning is given."""
     try:
         reader: Reader = READERS.load(plugin.name)()
         return reader
@@ -167,4 +168,5 @@ def _load_installed(plugin: Plugin) -> Reader | None:
 
 @cache
 def _warn_once(sentence: str) -> None:
+    """Log a warning the first time."""
     _LOG.warning("flowlab: %s", sentence)

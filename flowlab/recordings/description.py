@@ -96,4 +96,5 @@ def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
 
 
 def _info(name: str, time_s: Float64[np.ndarray, "N"]) -> StreamInfo:
+    """A stream in numbers."""
     return StreamInfo(name, len(time_s), sampling_rate(time_s), float(time_s[0]), float(time_s[-1]), find_gaps(time_s))

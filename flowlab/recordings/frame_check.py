@@ -89,11 +89,13 @@ def check_frames(
 
 
 def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | None) -> Int64[np.ndarray, "F"]:
+    """Indices of the color pictures that are asked for."""
     since = color.time_s - color.time_s[0]
     return np.flatnonzero((since >= start_s) & (since <= (np.inf if stop_s is None else stop_s)))[::every]
 
 
 def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageCheck]) -> _ImageCheck:
+    """Decode one picture and judge it."""
     try:
         return judge(stream.read(index))
     except BadImage as error:
@@ -101,10 +103,12 @@ def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageC
 
 
 def _look_at_color(picture: np.ndarray) -> _ImageCheck:
+    """Color is judged by its size."""
     return _ImageCheck((picture.shape[1], picture.shape[0]))
 
 
 def _look_at_depth(counts: np.ndarray) -> _ImageCheck:
+    """Depth is judged by its size and readings."""
     readings = counts[counts > 0]
     readings = readings[np.isfinite(readings)]
     size = counts.shape[1], counts.shape[0]
@@ -120,6 +124,7 @@ def _usual_size(needs_frame: Iterable[_ImageCheck]) -> Size:
 
 
 def _fault(name: str, look: _ImageCheck, usual: Size) -> BadFrame | None:
+    """What is wrong with a picture; None if nothing is."""
     if look.reason:
         return BadFrame(name, look.reason)
     if look.size != usual:
@@ -128,6 +133,7 @@ def _fault(name: str, look: _ImageCheck, usual: Size) -> BadFrame | None:
 
 
 def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: float) -> BadFrame | None:
+    """What is wrong where no sample of robot state is near enough; None if one is."""
     for stream, off in off_state.items():
         if off[k] > max_state_s:
             return BadFrame(name, f"no {stream} within {_ms(max_state_s)}: the nearest is {_ms(off[k])} away")
@@ -135,6 +141,7 @@ def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: 
 
 
 def _ms(seconds: float) -> str:
+    """Seconds in words."""
     return f"{1000 * seconds:.0f} ms"
 
 

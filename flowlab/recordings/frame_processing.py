@@ -114,6 +114,7 @@ def shrink_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndar
 
 
 def _intrinsics(path: Path, metadata: Metadata, size: Size, write_to: str) -> Intrinsics:
+    """The intrinsics of the color camera, where they can be those of pictures of this size."""
     given = metadata.intrinsics
     if given is None:
         raise DataError(
@@ -152,6 +153,7 @@ def _scaled(given: Intrinsics, of: Size, size: Size) -> Intrinsics:
 
 
 def _unit(path: Path, metadata: Metadata, median_counts: float, write_to: str) -> float:
+    """The unit of depth, where it makes a scene of plausible size."""
     unit = metadata.depth_unit_m
     likely = next((u for u in (1.0, 0.001, 0.0001) if PLAUSIBLE_M[0] < median_counts * u < 20), 0.001)
     hint = f"'depth_unit_m: {likely}' would make that {median_counts * likely:.3g} m"
@@ -171,6 +173,7 @@ def _unit(path: Path, metadata: Metadata, median_counts: float, write_to: str) -
 def _registration(
     path: Path, metadata: Metadata, color: Size, depth: Size, K: np.ndarray, *, registered: bool | None, write_to: str
 ) -> Registration | None:
+    """What moves depth to the color camera; None where it is seen from there."""
     camera, T = metadata.depth_intrinsics, metadata.T_color_depth
     apart = camera is not None or T is not None or registered is False
     if not apart and color == depth:

@@ -36,10 +36,12 @@ def depth_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"]) -> Ima
 
 
 def _name(file: Path) -> str:
+    """What errors call a file."""
     return f"{file.parent.name}/{file.name}"
 
 
-def _read(files, decode, index):  # type: ignore[no-untyped-def]
+def _read(files, decode, index) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """Decode the picture of a file."""
     file = files[index]
     try:
         content = file.read_bytes()
@@ -94,6 +96,7 @@ def _decode(content: bytes, how: int) -> np.ndarray:
 
 
 def _check_png(content: bytes) -> None:
+    """Refuse a PNG that has no end or a wrong checksum."""
     at = len(_PNG)
     while at + 12 <= len(content):
         size, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
@@ -109,6 +112,7 @@ def _check_png(content: bytes) -> None:
 
 
 def _load_array(file: Path) -> np.ndarray:
+    """The one array of a numpy file."""
     try:
         loaded = np.load(file)
         if isinstance(loaded, np.ndarray):

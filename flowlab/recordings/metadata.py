@@ -17,6 +17,7 @@ Row = tuple[float, float, float, float]
 
 
 def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    """Refuse rows that are no rigid transform."""
     T = np.array(rows)
     off = np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max()
     if not np.isfinite(T).all() or off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or tuple(rows[3]) != (0, 0, 0, 1):
@@ -72,6 +73,7 @@ class Intrinsics(Settings):
 
 
 def _plain(value: Any) -> str:
+    """A value as YAML has it."""
     return f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
 
 
@@ -146,6 +148,7 @@ def load_metadata(path: Path) -> Metadata:
 
 
 def _explain(error: ValidationError) -> str:
+    """The first thing that is wrong, with what exists where a key does not."""
     # A key misspelt is why another is missing, so it is named first.
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     where = ".".join(map(str, first["loc"]))

@@ -77,6 +77,7 @@ def find_recordings(paths: Sequence[Path], reader: str | None = None) -> list[Pa
 
 
 def _below(path: Path, readers: tuple[Reader, ...]) -> Iterator[Path]:
+    """The recordings at or below a path."""
     if any(recognizes(r, path) for r in readers):
         yield path
     elif path.is_dir():

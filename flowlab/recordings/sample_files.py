@@ -71,6 +71,7 @@ def _load(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
+    """Names of columns and rows of numbers of a text."""
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1)]
     rows = [(n, re.split(r"[,;\s]+", line.strip(",; "))) for n, line in lines if line and not line.startswith("#")]
     header: list[str] = []
@@ -86,6 +87,7 @@ def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
 
 
 def _table(path: Path, values: np.ndarray) -> np.ndarray:
+    """Values as rows (N, D)."""
     if values.ndim == 1:
         values = values[:, None]
     if values.ndim != 2 or not len(values):
@@ -94,6 +96,7 @@ def _table(path: Path, values: np.ndarray) -> np.ndarray:
 
 
 def _is_number(text: str) -> bool:
+    """Whether a text is a number."""
     try:
         float(text)
     except ValueError:

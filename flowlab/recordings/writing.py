@@ -84,6 +84,7 @@ def _write_pictures(
     steps: int,
     depth_unit_m: float,
 ) -> None:
+    """Write every frame, as many as there are times."""
     size, t = (camera.height, camera.width), -1
     for name in ("color", "depth"):
         (into / name).mkdir()
@@ -100,10 +101,12 @@ def _write_pictures(
 
 
 def _write_png(path: Path, picture: np.ndarray) -> None:
+    """Write a PNG; a disk that is full raises an error."""
     path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())  # imwrite fails without saying why
 
 
 def _counts(folder: Path, t: int, meters: np.ndarray, unit_m: float) -> np.ndarray:
+    """Depth [m] as 16-bit counts."""
     counts = np.rint(np.where(np.isfinite(meters) & (meters > 0), meters, 0).astype(np.float64) / unit_m)
     if counts.max(initial=0) > _MAX_COUNT:
         raise DataError(
@@ -114,6 +117,7 @@ def _counts(folder: Path, t: int, meters: np.ndarray, unit_m: float) -> np.ndarr
 
 
 def _yaml(camera: Camera, files: list[str], depth_unit_m: float, success: bool, task: str | None) -> str:
+    """The content of ``recording.yaml``."""
     intrinsics = Intrinsics.from_matrix(camera.K, width=camera.width, height=camera.height)
     lines = [
         "times: times.txt",

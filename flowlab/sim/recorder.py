@@ -10,6 +10,7 @@ from pydantic import Field
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError
+from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import pose_9d, rigid
 from flowlab.records import Demonstration, Frame
 from flowlab.sim.render.zbuffer import PackedScene, ZBuffer
@@ -23,6 +24,18 @@ class Renderer(Protocol):
     def frame(self, poses: Poses) -> Frame:
         """The picture from the renderer's camera."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Relocated:
+    """The pictures of a renderer, as those of a camera whose pose is given in another frame."""
+
+    renderer: Renderer
+    camera: Camera
+
+    def frame(self, poses: Poses) -> Frame:
+        """The picture from the renderer's camera."""
+        return replace(self.renderer.frame(poses), camera=self.camera)
 
 
 class ExpertSettings(Settings):
@@ -50,7 +63,7 @@ class Rollout(Demonstration):
 
     def frame(self, t: int) -> Frame:
         """The picture taken at step ``t``, before action ``t``."""
-        return replace(self.renderer.frame(self.poses.at(t)), camera=self.camera)
+        return self.renderer.frame(self.poses.at(t))
 
 
 class EpisodeRecorder:
@@ -61,6 +74,7 @@ class EpisodeRecorder:
         self.camera, self.T_world_sim = simulation.camera(), np.eye(4)
         if simulation.settings.convention == "dp3":
             self.camera, self.T_world_sim = dp3_camera(self.camera)
+            self.renderer = _Relocated(renderer, self.camera)
         self._poses: list[Poses] = []
         self._state: list[np.ndarray] = []
         self._action: list[np.ndarray] = []
@@ -69,7 +83,7 @@ class EpisodeRecorder:
 
     def frame(self) -> Frame:
         """The picture of this moment."""
-        return replace(self.renderer.frame(self.simulation.poses()), camera=self.camera)
+        return self.renderer.frame(self.simulation.poses())
 
     @property
     def unstable(self) -> bool:

@@ -80,7 +80,7 @@ def _provenance(values: Json, settings: Mapping[str, Any]) -> Provenance:
         known |= {"tracks": "exact"}
     if "track" in settings:
         known |= {"tracks": "estimated", "tracker": _setting(settings, "track", "tracker")}
-    return Provenance(**known)
+    return Provenance.model_validate(known)
 
 
 def _setting(settings: Mapping[str, Any], stage: str, name: str) -> Any:

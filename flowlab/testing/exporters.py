@@ -191,29 +191,35 @@ class _Failing(Dataset):
             yield episode
 
     def _count_down(self) -> None:
+        """One episode less; something happens when none is left."""
         if self._whole == 0:
             self._happen()
         self._whole -= 1
 
     def _happen(self) -> None:
+        """What happens."""
         raise NotImplementedError
 
 
 class _Damaged(_Failing):
     def _happen(self) -> None:
+        """What happens."""
         raise DataError(f"{self.path}: damaged for a check")
 
 
 class _Killing(_Failing):
     def _happen(self) -> None:
+        """What happens."""
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _tasks(dataset: Dataset) -> list[str]:
+    """The tasks of a dataset."""
     return sorted({ref.task for ref in dataset.refs})
 
 
 def _refused(make: MakeExporter, dataset: Dataset, path: Path, what: str, task: str | None = None) -> None:
+    """Require that an export is refused in one sentence."""
     try:
         make().export(dataset, path, task)
     except FlowlabError as error:
@@ -226,5 +232,6 @@ def _refused(make: MakeExporter, dataset: Dataset, path: Path, what: str, task: 
 
 @contextmanager
 def _place() -> Iterator[Path]:
+    """A temporary folder."""
     with tempfile.TemporaryDirectory(prefix="flowlab-check-") as folder:
         yield Path(folder).resolve()

@@ -23,7 +23,7 @@ from flowlab.data.needs import Needs
 from flowlab.data.settings import TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Losses, PolicyNetwork, PolicySpec
-from flowlab.testing.policy_problem import ACTION, Problem, make_problem
+from flowlab.testing.policy_problem import ACTION, PICTURE, Problem, make_problem
 
 STEPS = 60
 """Training steps within which the loss must fall."""
@@ -39,7 +39,7 @@ def check_policy(policy: Policy, settings: Sequence[str] = ()) -> None:
 def check_settings(policy: Policy, settings: Sequence[str] = ()) -> None:
     """It has a title; every setting has a default; settings say what it needs, and survive JSON."""
     _require(isinstance(getattr(policy, "title", None), str), "title must be what people call the policy")
-    model = getattr(policy, "settings_class", None)
+    model: Any = getattr(policy, "settings_class", None)
     _require(isinstance(model, type) and issubclass(model, TrainSettings), "settings_class must be of TrainSettings")
     missing = next(_without_default(model), None)
     _require(missing is None, f"every setting must have a default, and {missing} has none")
@@ -82,7 +82,7 @@ def check_gradients(policy: Policy, settings: Sequence[str] = ()) -> None:
     grouped = [id(p) for modules in groups.values() for m in modules for p in m.parameters()]
     for key, name in names.items():
         _require(grouped.count(key) == 1, f"{name} must be in one parameter group, but is in {grouped.count(key)}")
-    _losses(problem).total.backward()
+    _losses(problem).total.backward()  # type: ignore[no-untyped-call]
     for name, p in problem.policy.named_parameters():
         _require(p.grad is not None and bool(p.grad.abs().max() > 0), f"{name} gets no gradient: nothing teaches it")
         _require(p.grad is not None and bool(p.grad.isfinite().all()), f"the gradient of {name} must be finite")
@@ -93,13 +93,13 @@ def check_learning(policy: Policy, settings: Sequence[str] = ()) -> None:
     problem = make_problem(policy, settings)
     optimizer = torch.optim.Adam(problem.policy.parameters(), 3e-3)
     with torch.no_grad():
-        before = _losses(problem, 1000).total
+        before = _losses(problem, 10**6).total
     for step in range(STEPS):
         optimizer.zero_grad()
-        _losses(problem, step).total.backward()
+        _losses(problem, step).total.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     with torch.no_grad():
-        after = _losses(problem, 1000).total
+        after = _losses(problem, 10**6).total
     _require(after < 0.9 * before, f"in {STEPS} steps the loss must fall by a tenth, but goes from {before} to {after}")
 
 
@@ -156,7 +156,8 @@ def check_needs(policy: Policy, settings: Sequence[str] = ()) -> None:
         "flow": (needs.flow is None, torch.full((windows, horizon, 3, 3), torch.nan)),
         "flow_weight": (needs.flow is None, torch.full((windows, horizon, 3), torch.nan)),
         "object_pose": (not needs.object_pose, torch.full((windows, horizon, 9), torch.nan)),
-        "depth": (not needs.depth, torch.full((frames, 4, 4), torch.nan)),
+        "depth": (not needs.depth, torch.full((frames, PICTURE, PICTURE), torch.nan)),
+        "rgb": (not needs.rgb, torch.full((frames, PICTURE, PICTURE, 3), 255, dtype=torch.uint8)),
     }
     other = replace(batch, **{name: value for name, (unneeded, value) in nothing.items() if unneeded})
     mine, theirs = (problem.policy.plan(_context(b), _generator(0)).action for b in (batch, other))

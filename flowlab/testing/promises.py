@@ -38,6 +38,7 @@ def elsewhere(folder: Path) -> Iterator[None]:
 
 
 def _digest(path: Path) -> str:
+    """What tells the content of a file from that of others."""
     if path.is_symlink():
         return f"to {path.readlink()}"
     if path.is_dir():

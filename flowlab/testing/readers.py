@@ -172,6 +172,7 @@ _DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 
 def _read(reader: Reader, recording: Path) -> Streams:
+    """The streams of a recording, with what is beside it."""
     return reader.read(recording, known_beforehand(recording, RecordingSettings()))
 
 
@@ -200,12 +201,14 @@ def _complaint(make: MakeReader, recording: Path, what: str) -> bool:
 
 
 def _check_images(what: str, images: ImageStream) -> None:
+    """Require names and times of pictures."""
     require(len(images) > 0, f"the {what} stream must have pictures")
     require(all(isinstance(n, str) and n for n in images.names), f"every {what} picture must have a name")
     _check_times(f"the {what} stream", images.time_s, len(images))
 
 
 def _check_samples(samples: SampleStream) -> None:
+    """Require times and finite float32 rows."""
     require_words(samples, "name")
     values = samples.values
     _check_times(f"the stream '{samples.name}'", samples.time_s, len(values))
@@ -215,6 +218,7 @@ def _check_samples(samples: SampleStream) -> None:
 
 
 def _check_times(what: str, time_s: np.ndarray, count: int) -> None:
+    """Require as many times as there are things, in seconds and in order."""
     require(time_s.shape == (count,), f"{what} must have a time for each of {count}, but has {time_s.shape}")
     require(time_s.dtype == np.float64, f"{what} must have times of float64 [s], but they are {time_s.dtype}")
     require(np.isfinite(time_s).all() and (np.diff(time_s) >= 0).all(), f"{what} must be in the order of time")
@@ -223,6 +227,7 @@ def _check_times(what: str, time_s: np.ndarray, count: int) -> None:
 
 
 def _decoded(images: ImageStream, k: int, what: str) -> np.ndarray:
+    """A picture, of the type and shape that its stream should have."""
     try:
         picture = images.read(k)
     except BadImage as error:
@@ -270,5 +275,6 @@ def _copied(recording: Path, folder: Path) -> Path:
 
 @contextmanager
 def _place() -> Iterator[Path]:
+    """A temporary folder."""
     with tempfile.TemporaryDirectory(prefix="flowlab-check-") as folder:
         yield Path(folder).resolve()

@@ -185,6 +185,7 @@ def _queries(*frames: int) -> np.ndarray:
 
 
 def _check_record(tracks: Tracks2D, frames: int, points: int) -> None:
+    """Require shapes, types and ranges of a record."""
     require(isinstance(tracks, Tracks2D), f"track() must return a Tracks2D, but returns a {type(tracks).__name__}")
     for field in fields(Tracks2D):
         value = getattr(tracks, field.name)
@@ -221,6 +222,7 @@ def _check_positions(tracks: Tracks2D) -> None:
 
 
 def _check_motion(tracks: Tracks2D, queries: np.ndarray, start: int) -> None:
+    """Require that points are where the picture went."""
     t = start + np.arange(len(tracks.xy))[:, None]
     after = t > queries[:, 0]
     if not after.any():

@@ -28,6 +28,7 @@ class ChunkSettings(Settings):
 
     @model_validator(mode="after")
     def _overlapping(self) -> "ChunkSettings":
+        """Refuse chunks that leave a gap."""
         if self.stride >= self.length:
             raise ValueError(f"stride ({self.stride}) must be below length ({self.length}): chunks have to overlap")
         return self

@@ -112,7 +112,7 @@ def _between(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return values
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _read(  # type: ignore[no-untyped-def]
     depth,
     xy,
@@ -126,7 +126,7 @@ def _read(  # type: ignore[no-untyped-def]
     jump_m,
     unseen_m,
     reach_m,
-):
+) -> tuple[np.ndarray, ...]:
     """Depth, source, whether a reading fits, and whether something else was read instead: (T, M) each."""
     steps, points = visible.shape
     z, source = np.zeros((steps, points)), np.full((steps, points), FILLED, np.uint8)
@@ -161,16 +161,16 @@ def _read(  # type: ignore[no-untyped-def]
     return z, source, fits, hidden
 
 
-@numba.njit(cache=True)
-def _own_reading(depth, u, v):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _own_reading(depth, u, v) -> float:  # type: ignore[no-untyped-def]
     """Depth at the nearest pixel; -1 outside the picture."""
     column, row = int(np.rint(u)), int(np.rint(v))
     inside = 0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]
     return np.float64(depth[row, column]) if inside else -1.0
 
 
-@numba.njit(cache=True)
-def _readings(depth, u, v, window, around, distance):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _readings(depth, u, v, window, around, distance) -> int:  # type: ignore[no-untyped-def]
     """Fill in the depths in the window around a point, and their pixels' distances from it; how many there are."""
     column, row = int(np.rint(u)), int(np.rint(v))
     count = 0
@@ -182,8 +182,8 @@ def _readings(depth, u, v, window, around, distance):  # type: ignore[no-untyped
     return count
 
 
-@numba.njit(cache=True)
-def _continuing(around, distance, last, nearness):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _continuing(around, distance, last, nearness) -> float:  # type: ignore[no-untyped-def]
     """The reading that best continues depth ``last``, or the nearest where that is not known (0); inf if none."""
     best, cost = np.inf, np.inf
     for z, d in zip(around, distance):  # noqa: B905 (numba)
@@ -193,8 +193,8 @@ def _continuing(around, distance, last, nearness):  # type: ignore[no-untyped-de
     return best
 
 
-@numba.njit(cache=True)
-def _layer_mean(around, distance, z, thickness, spread):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _layer_mean(around, distance, z, thickness, spread) -> float:  # type: ignore[no-untyped-def]
     """Mean of the readings that lie within ``thickness`` of depth ``z``, weighted by nearness to the point."""
     total, weight = 0.0, 0.0
     for other, d in zip(around, distance):  # noqa: B905

@@ -51,7 +51,7 @@ class RunningMeans:
 
     def state(self) -> dict[str, float]:
         """What :meth:`load_state` goes on from; empty where nothing was added."""
-        return {"count": self._count, **self._sums} if self._count else {}
+        return {"count": float(self._count), **self._sums} if self._count else {}
 
     def load_state(self, state: Mapping[str, float]) -> None:
         """Go on from what :meth:`state` gave."""

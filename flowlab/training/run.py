@@ -183,14 +183,17 @@ def _new_policy(
         return make_policy(spec)
     check_observer(loaded.trained, loaded.path, source)
     old = loaded.trained.policy
+    other = UsageError(
+        f"{loaded.path}: its network has another shape than the one asked for; train with the policy, profile and "
+        f"settings of {began_from}, on data with the same tasks, state and actions"
+    )
+    if old.settings.policy != settings.policy:
+        raise other
     policy = make_policy(spec.model_copy(update={"normalizer": old.normalizer, "channels": old.channels}))
     try:
         policy.load_state_dict(loaded.policy.state_dict())
     except RuntimeError as error:
-        raise UsageError(
-            f"{loaded.path}: its network has another shape than the one asked for; train with the policy, profile and "
-            f"settings of {began_from}, on data with the same tasks, state and actions"
-        ) from error
+        raise other from error
     return policy
 
 

@@ -69,7 +69,7 @@ MISTAKES = {
     "validate nothing": (["validate", "none"], 3, "none: 1 finding"),
     "viz of nothing": (["viz", "none"], 3, "none: there is no such folder"),
     "export of nothing": (["export", "none", "--to", "dp3", "--out", "x"], 3, "none: there is no such folder"),
-    "export to nothing": (["export", "none", "--to", "dp4", "--out", "x"], 2, "'dp3'"),
+    "export to nothing": (["export", "none", "--to", "dp4", "--out", "x"], 2, "did you mean dp3"),
     "info of a file": (["info", "file"], 3, "file: not a flowlab dataset"),
     "info of a folder": (["info", "."], 3, ".: not a flowlab dataset (it has no flowlab.json)"),
 }  # fmt: skip

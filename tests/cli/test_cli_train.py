@@ -179,7 +179,7 @@ def test_dp3_trains_on_a_store_in_its_own_layout(rolls: Path, tmp_path: Path, ca
     about = policy_of(tmp_path / "run")["policy"]
     assert (about["observer"], about["tasks"], about["channels"]["gripper"]) == (None, ["roll"], None)
     before = files_below(tmp_path)
-    for policy, reason in (("fdp", "the dataset has no query points"), ("mba", "has no object poses")):
+    for policy, reason in (("fdp", "has no query points, which fdp is trained on"), ("mba", "has no object poses")):
         command = ("train", tmp_path / "roll.zarr", "--policy", policy, "--out", tmp_path / policy, *SMALL)
         code, out, err = call_cli(capsys, *command)
         assert (code, out) == (3, "")
@@ -256,10 +256,10 @@ def test_another_network_is_refused(rolls: Path, taught: Path, tmp_path: Path, c
 WRONG: dict[str, tuple[list[str], int, str]] = {
     "no policy of that name": (["--policy", "fpd"], 2, "no policy is called 'fpd'; did you mean fdp?"),
     "no profile of that name": (["--profile", "fsat"], 2, "no profile is called 'fsat'; did you mean fast?"),
-    "no profile file": (["--profile", "no.yaml"], 2, "no.yaml: cannot read the profile (No such file or directory)"),
-    "no group of settings": (options("motoin.points=3"), 2, "no setting is called 'motoin'; did you mean motion?"),
+    "no profile file": (["--profile", "no.yaml"], 2, "no.yaml: cannot read the profile (No such file"),
+    "no group of settings": (options("motoin.points=3"), 2, "no setting of fdp is called 'motoin'; there are: "),
     "no setting": (options("motion.point=3"), 2, "motion.point: no setting is called 'point'; did you mean points?"),
-    "no value": (options("motion.points"), 2, "--set motion.points: must look like motion.points=50"),
+    "no value": (options("motion.points"), 2, "--set motion.points: must look like batch.windows=64"),
     "wrong value": (options("motion.points=many"), 2, "motion.points: "),
     "too many query points": (options("motion.points=9"), 3, "motion.points is 9, and the dataset has 8 query points"),
     "too many points": (
@@ -402,3 +402,11 @@ def test_what_was_decoded_is_used_until_the_data_change(tmp_path: Path, capsys: 
     assert [len(run["train"]) for run in runs] == [3, 3, 4]
     assert policy_of(tmp_path / "b")["fingerprint"] != policy_of(tmp_path / "c")["fingerprint"]
     assert leftovers(tmp_path) == []
+
+
+def test_help_lists_the_policies_and_loggers_that_are_installed(capsys: Capture) -> None:
+    code, out, _ = call_cli(capsys, "train", "--help")
+    assert code == 0
+    said = " ".join(out.split())
+    assert "There are: dp3, fdp, mba; or module:Class." in said
+    assert "There are: tensorboard, wandb; or module:Class." in said

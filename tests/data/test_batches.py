@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flowlab.data.batch_builder import BatchBuilder
-from flowlab.data.batches import Batch
+from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.channels import ChannelSpec
-from flowlab.data.needs import Needs
+from flowlab.data.needs import CloudNeeds, FlowNeeds, Needs
 from flowlab.data.query_points import choose_queries
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.settings import TrainSettings
+from flowlab.data.settings import BatchSettings, TrainSettings
 from flowlab.data.window_sampler import WindowIndex, WindowSampler, index_windows
 from flowlab.errors import DataError, UsageError
 from flowlab.policies.fdp import FDPSettings
@@ -481,3 +481,78 @@ def test_queries_that_are_not_there_are_refused() -> None:
         with pytest.raises(DataError, match=r"pour seed 1: none of its 12 query points is known to lie on an object"):
             choose_queries(buffer, motion(f"motion.sampling={sampling}"))
     assert choose_queries(buffer, motion("motion.sampling=scene")).shape == (3, 6)
+
+
+# What a policy needs.
+
+
+def needing(needs: Needs) -> Any:
+    class Settings(TrainSettings):
+        @property
+        def needs(self) -> Needs:
+            return needs
+
+    return Settings(policy="x", horizon=8, n_action_steps=4, batch=BatchSettings(shift_m=0, turn_deg=0))
+
+
+def with_pictures() -> ReplayBuffer:
+    rng, buffer = np.random.default_rng(0), random_buffer()
+    frames = len(buffer.state)
+    return replace(
+        buffer,
+        rgb=rng.integers(0, 256, (frames, 4, 6, 3), np.uint8),
+        depth=rng.random((frames, 4, 6), np.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("needs", "shapes"),
+    [
+        (Needs(), {}),
+        (Needs(point_cloud=CloudNeeds(5)), {"points": (5, 3)}),
+        (Needs(flow=FlowNeeds(4)), {"queries": (4, 3), "flow": (8, 4, 3), "flow_weight": (8, 4)}),
+        (Needs(object_pose=True), {"object_pose": (8, 9)}),
+        (Needs(rgb=True), {"rgb": (4, 6, 3)}),
+        (Needs(depth=True), {"depth": (4, 6)}),
+    ],
+)
+def test_a_batch_has_what_is_needed_and_nothing_else(needs: Needs, shapes: dict[str, tuple[int, ...]]) -> None:
+    buffer, s = with_pictures(), needing(needs)
+    batch = builder(s, buffer).build(every_window(buffer, s))
+    empty = {"points": (0, 3), "queries": (0, 3), "flow": (8, 0, 3), "flow_weight": (8, 0), "object_pose": (8, 0),
+             "rgb": None, "depth": None}  # fmt: skip
+    for name, nothing in empty.items():
+        value = getattr(batch, name)
+        assert (None if value is None else tuple(value.shape[1:])) == shapes.get(name, nothing), name
+    assert batch.action.shape[1:] == (8, 4)
+    assert batch.state.shape[1:] == (9,)
+
+
+def test_windows_share_pictures_as_they_share_frames() -> None:
+    buffer, s = with_pictures(), needing(Needs(rgb=True, depth=True))
+    assert buffer.rgb is not None
+    assert buffer.depth is not None
+    windows = every_window(buffer, s)
+    batch = builder(s, buffer).build(windows)
+    for part, first in ((batch, 0), (batch.part(slice(7, 19)), 7)):
+        assert part.rgb is not None
+        assert part.depth is not None
+        assert len(part.rgb) == len(part.depth) == len(part.state)
+        for w in range(len(part.observed)):
+            now = windows.now[first + w]
+            np.testing.assert_array_equal(part.rgb[part.observed[w, -1]], buffer.rgb[now])
+            np.testing.assert_array_equal(part.depth[part.observed[w, -1]], buffer.depth[now])
+
+
+def test_batches_together_have_the_windows_of_all() -> None:
+    buffer, s = with_pictures(), needing(Needs(point_cloud=CloudNeeds(5), rgb=True))
+    batch = builder(s, buffer).build(every_window(buffer, s))
+    parts = [batch.part(slice(k, k + 5)) for k in (0, 5, 10)]
+    whole = ObservationBatch.concatenate(parts)
+    assert whole.depth is None
+    assert whole.rgb is not None
+    assert len(whole.state) == sum(len(p.state) for p in parts)
+    for w in range(15):
+        for name in ("points", "state", "rgb"):
+            mine, theirs = getattr(whole, name)[whole.observed[w]], getattr(batch, name)[batch.observed[w]]
+            assert torch.equal(mine, theirs), name

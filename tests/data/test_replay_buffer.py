@@ -215,3 +215,44 @@ def test_the_last_of_each_task_are_held_out(
     """Six of one task, three of the next, one of the last: two thirds of each, rounded up, remain at least."""
     buffer = random_buffer([("a", 3)] * 6 + [("b", 3)] * 3 + [("c", 3)], points=1, queries=1)
     assert buffer.split(demonstrations, held_out) == (train, held)
+
+
+def pictured(seed: int, *, rgb: bool = True) -> Episode:
+    e, rng = make_episode(seed), np.random.default_rng(seed)
+    color = rng.integers(0, 256, (len(e), 12, 16, 3), np.uint8)
+    return replace(e, rgb=color if rgb else None, depth=rng.random((len(e), 12, 16), np.float32))
+
+
+def test_pictures_are_decoded_when_they_are_wanted(tmp_path: Path) -> None:
+    episodes = [pictured(k) for k in range(3)]
+    source = write(tmp_path / "d", episodes)
+    plain = load_buffer(source, tmp_path / "run")
+    assert (plain.rgb, plain.depth) == (None, None)
+    before = files_below(tmp_path / "d/cache")
+    assert not any("rgb" in name or "depth" in name for name in before)
+    buffer = load_buffer(source, tmp_path / "run", ("rgb",))
+    assert buffer.depth is None
+    assert buffer.rgb is not None
+    assert buffer.rgb.dtype == np.uint8
+    for demo, e in zip(buffer.episodes, episodes, strict=True):
+        np.testing.assert_array_equal(buffer.rgb[demo.start : demo.stop], e.rgb)
+    both = load_buffer(source, tmp_path / "run", ("rgb", "depth"))
+    assert both.depth is not None
+    np.testing.assert_array_equal(both.depth[both.episodes[1].start], episodes[1].depth[0])
+    after = files_below(tmp_path / "d/cache")
+    assert {name: after[name] for name in before} == before, "what was decoded is not decoded again"
+
+
+def test_pictures_that_the_dataset_lacks_are_none(tmp_path: Path) -> None:
+    source = write(tmp_path / "d", [make_episode(k) for k in range(3)])
+    for _ in range(2):
+        buffer = load_buffer(source, tmp_path / "run", ("rgb", "depth"))
+        assert (buffer.rgb, buffer.depth) == (None, None)
+
+
+def test_pictures_of_some_episodes_only_are_refused(tmp_path: Path) -> None:
+    episodes = [pictured(0), pictured(1), pictured(2, rgb=False)]
+    source = replace(write(tmp_path / "d", episodes[:2]), episodes=lambda: iter(episodes), frames=36)
+    load_buffer(source, tmp_path / "run")
+    with pytest.raises(DataError, match="roll seed 2: 'rgb' is in some episodes only; train on those that have it"):
+        load_buffer(source, tmp_path / "run", ("rgb",))

@@ -18,16 +18,16 @@ from flowlab.data import Windows
 from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.exporters.dp3 import export_dp3
+from flowlab.storage.exporters.dp3 import DP3Exporter
 
 LENGTHS = (9, 14, 6)
 
 
 def with_pictures(e: Episode) -> Episode:
     rng = np.random.default_rng(e.seed)
-    depth = rng.uniform(0.5, 1, (len(e), 6, 8)).astype(np.float32)
+    depth = rng.uniform(0.5, 1, (len(e), 12, 16)).astype(np.float32)
     depth[:, 0] = 0
-    return replace(e, rgb=rng.integers(0, 256, (len(e), 6, 8, 3), np.uint8), depth=depth)
+    return replace(e, rgb=rng.integers(0, 256, (len(e), 12, 16, 3), np.uint8), depth=depth)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_loaders_with_workers_see_every_window_once(data: Path, episodes: list[E
     for batch in loader:
         assert batch["point_cloud"].shape[1:] == (2, *episodes[0].point_cloud.shape[1:])
         assert batch["action"].shape[1:] == (8, episodes[0].action.shape[1])
-        assert batch["rgb"].shape[1:] == (1, 3, 6, 8)
+        assert batch["rgb"].shape[1:] == (1, 3, 12, 16)
         seen += list(zip(batch["episode_index"].tolist(), batch["frame_index"].tolist(), strict=True))
         for k, (e, t) in enumerate(seen[-len(batch["action"]) :]):
             np.testing.assert_array_equal(batch["action"][k, 0], episodes[e].action[t])
@@ -159,7 +159,7 @@ def test_rows_that_are_not_evenly_spaced_have_no_times(tmp_path: Path) -> None:
 
 
 def test_a_store_of_dp3_does_not_tell_times(data: Path, tmp_path: Path, episodes: list[Episode]) -> None:
-    export_dp3(Dataset(data), tmp_path / "s.zarr", "roll")
+    DP3Exporter().export(Dataset(data), tmp_path / "s.zarr", "roll")
     windows = Windows(tmp_path / "s.zarr", {"point_cloud": [0], "action": [0, 1]})
     assert len(windows) == sum(LENGTHS)
     assert "tracks" not in windows.keys

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from synthetic import call_cli
-from trained_runs import NETWORK, make_run, options, policy_of
+from trained_runs import NETWORK, make_run, options, policy_of, saved_by
 
 Capture = pytest.CaptureFixture[str]
 LINES = "evaluation/step-00000002-execute-8/episodes.jsonl"
@@ -52,6 +52,7 @@ def test_it_knows_scene_and_channels_and_its_episodes_go_the_same(
     for key in ("scene", "scene_seeds", "fingerprint"):
         assert policy_of(mine)[key] == policy_of(theirs)[key]
     assert policy_of(mine)["policy"] == policy_of(theirs)["policy"]
+    assert saved_by(mine) == saved_by(theirs)
     for run in (mine, theirs):
         code, _, err = call_cli(capsys, "eval", run, "--seeds", "1", "--episodes", "2", "--workers", "1", "--json")
         assert code == 0, err

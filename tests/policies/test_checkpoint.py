@@ -129,7 +129,7 @@ def test_nothing_is_pickled(run: Path, rolls: Path) -> None:
 
 def test_policy_json_tells_what_the_policy_is(run: Path, rolls: Path) -> None:
     about = policy_of(run)
-    assert about["format"] == 1
+    assert about["format"] == 2
     assert (about["dataset"], about["fingerprint"]) == (str(rolls), Dataset(rolls).fingerprint)
     assert about["versions"] == {
         "flowlab": flowlab.__version__, "torch": torch.__version__, "numpy": version("numpy"),
@@ -150,9 +150,9 @@ def test_policy_json_tells_what_the_policy_is(run: Path, rolls: Path) -> None:
 
 def test_a_format_of_the_future_is_refused(run: Path, tmp_path: Path, capsys: Capture) -> None:
     shutil.copytree(run, tmp_path / "run")
-    about = policy_of(run) | {"format": 2}
+    about = policy_of(run) | {"format": 3}
     (tmp_path / "run/policy.json").write_text(json.dumps(about))
-    sentence = f"{tmp_path / 'run/policy.json'}: format is 2, this flowlab reads 1; use the flowlab that wrote it"
+    sentence = f"{tmp_path / 'run/policy.json'}: format is 3, this flowlab reads 2; use the flowlab that wrote it"
     with pytest.raises(DataError, match=re.escape(sentence)):
         load_policy(tmp_path / "run")
     assert call_cli(capsys, "train", tmp_path / "run", "--resume") == (3, "", f"flowlab: {sentence}\n")
@@ -233,8 +233,8 @@ def test_a_full_disk_costs_no_more_than_the_steps_since(
         code, out, err = call_cli(capsys, "train", tmp_path / "run", "--resume", "--json")
     assert (code, out) == (3, "")
     assert re.fullmatch(
-        rf"flowlab: {tmp_path / 'run'}: cannot be written \(.*File too large.*\); what was kept before is whole\. Make "
-        rf"room, then go on with 'flowlab train {tmp_path / 'run'} --resume'\n",
+        rf"flowlab: {tmp_path / 'run'}: cannot be written \(.*File too large.*\); what was saved before is whole\. "
+        rf"Make room, then go on with 'flowlab train {tmp_path / 'run'} --resume'\n",
         err,
     )
     assert {name: content for name, content in saved_by(tmp_path / "run").items() if name in whole} == whole

@@ -14,7 +14,8 @@ from flowlab.data.channels import ChannelSpec
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
 from flowlab.data.settings import TrainSettings
 from flowlab.data.window_sampler import WindowIndex
-from flowlab.policies.base import ActionPlan, Generators, PolicyNetwork
+from flowlab.nets.diffusion import NoiseSampler
+from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, make_policy
 from flowlab.training.validation import validate
 
 NOW, HORIZON, EXECUTED, LENGTH = 1, 8, 4, 30
@@ -28,13 +29,17 @@ class Oracle(PolicyNetwork):
     flow_off = pose_off = (0.0, 0.0, 0.0)
     from_row, to_row = 0, HORIZON
 
-    def plan(self, context: ObservationBatch, noise_from: Generators = None) -> ActionPlan:
+    def compute_loss(self, batch: Batch, noise: NoiseSampler, windows: int) -> Losses:
+        raise AssertionError("is not trained")
+
+    def plan(self, context: ObservationBatch, generators: Generators = None) -> ActionPlan:
         assert isinstance(context, Batch)
         rows = slice(self.from_row, self.to_row)
         flow, pose = context.flow.clone(), context.object_pose.clone()
         flow[:, rows] += torch.tensor(self.flow_off)
-        pose[:, rows] += torch.tensor([*self.pose_off] + [0.0] * 6)
         name = self.spec.settings.policy
+        if name == "mba":
+            pose[:, rows] += torch.tensor([*self.pose_off] + [0.0] * 6)
         return ActionPlan(
             context.action + self.action_off,
             flow if name == "fdp" else None,
@@ -113,7 +118,7 @@ def test_only_executed_actions_count_and_only_demonstrated_ones() -> None:
     # Of a demonstration of two steps, three of four executed actions have no truth where now is the last.
     short = random_buffer([("roll", 2)])
     off = {"action_off": torch.tensor([0.0, 3.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0])[:, None]}
-    windows = {"demo": np.zeros(1, int), "now": np.ones(1, int), "run": np.zeros(1, int)}
+    windows = {"episode": np.zeros(1, int), "now": np.ones(1, int), "run": np.zeros(1, int)}
     settings = tiny_settings("dp3")
     builder = BatchBuilder(short, ChannelSpec(), settings, short.tasks)
     found = validate(oracle(settings, **off), builder, WindowIndex(**windows), torch.device("cpu"))
@@ -204,7 +209,7 @@ def test_the_position_of_an_object_is_off_by_so_many_mm() -> None:
 
 def test_a_real_policy_has_the_same_errors_each_time() -> None:
     torch.manual_seed(0)
-    policy = PolicyNetwork(tiny_spec(tiny_settings("fdp")))
+    policy = make_policy(tiny_spec(tiny_settings("fdp")))
     first = errors(random_buffer(), policy)
     torch.manual_seed(1)
     assert errors(random_buffer(), policy) == first
@@ -215,10 +220,10 @@ def test_of_many_windows_some_are_looked_at_evenly_spaced() -> None:
     seen: list[float] = []
 
     class Counting(Oracle):
-        def plan(self, context: ObservationBatch, noise_from: Generators = None) -> ActionPlan:
+        def plan(self, context: ObservationBatch, generators: Generators = None) -> ActionPlan:
             assert len(context.observed) <= 64
             seen.extend(context.state[context.observed[:, -1], 0].tolist())
-            return super().plan(context, noise_from)
+            return super().plan(context, generators)
 
     settings = tiny_settings("dp3")
     buffer = random_buffer([("roll", 1003)], points=24)
@@ -235,7 +240,7 @@ def test_windows_are_weighed_alike_however_they_are_portioned() -> None:
     buffer = rolling(3)
     demos = tuple(EpisodeSlice("roll", d.seed, d.start, d.stop) for d in buffer.episodes)
     policy = oracle(tiny_settings("fdp"), flow_off=(0.001, 0.0, 0.0))
-    whole = errors(replace(buffer, demos=demos), policy)
+    whole = errors(replace(buffer, episodes=demos), policy)
     windows = every_window(buffer, policy.spec.settings)
     assert len(windows.now) == 81
     steps = [np.arange(1, min(HORIZON - NOW, LENGTH - 1 - now) + 1) for now in range(27)]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from trained_runs import SMALL, make_rolls, train
 
 from flowlab.errors import MissingLibraryError, UsageError
 from flowlab.training.loggers import make_logger
@@ -160,3 +161,35 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_unknown_log_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no logger is called 'tensorbord'; did you mean tensorboard"):
         make_logger("tensorbord", tmp_path, "push-fdp", SETTINGS)
+
+
+OWN = """
+import json
+from flowlab.training.loggers import MetricsLogger
+
+
+class Lines(MetricsLogger):
+    def __init__(self, folder, run, settings):
+        self.file = folder / "lines.txt"
+        self.file.write_text(f"{run} {settings['policy']}\\n")
+
+    def write(self, step, values):
+        self.file.write_text(self.file.read_text() + f"{step} {sorted(values)[0]}\\n")
+
+    def close(self):
+        self.file.write_text(self.file.read_text() + "closed\\n")
+"""
+
+
+def test_a_logger_of_ones_own_lies_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my_own_logger.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    train(capsys, make_rolls(tmp_path / "d"), "--policy", "dp3", "--out", "run", *SMALL, "--log", "my_own_logger:Lines")
+    lines = (tmp_path / "run/lines.txt").read_text().splitlines()
+    assert lines[0] == "run dp3"
+    assert "20 train/action_loss" in lines
+    assert lines[-1] == "closed"
+    assert sys.path == before

@@ -107,10 +107,12 @@ def _find(path: Path) -> dict[str, str]:
 
 
 def _called(name: str, count: int) -> tuple[str, ...]:
+    """Names of the pictures of an array."""
     return tuple(f"{name}[{k}]" for k in range(count))
 
 
 def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.ndarray) -> None:
+    """Refuse arrays that are no color and depth of one episode."""
     path, ends = store.path, store.load("ends")
     if ends is not None and np.size(ends) > 1:
         raise DataError(f"{path}: holds {np.size(ends)} episodes, one after the other; write one file per episode")
@@ -127,15 +129,18 @@ def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.nd
 
 
 def _color(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
+    """One color picture, channels last."""
     picture = np.asarray(pictures[index])
     return np.ascontiguousarray(picture if picture.shape[-1] == 3 else picture.transpose(1, 2, 0))
 
 
 def _depth(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
+    """One depth picture."""
     return check_depth(np.array(pictures[index]))
 
 
 def _times(store: _Store, steps: int, given: Metadata) -> np.ndarray:
+    """When every step was [s]."""
     time_s = store.load("time")
     if time_s is not None:
         if time_s.shape != (steps,):
@@ -148,6 +153,7 @@ def _times(store: _Store, steps: int, given: Metadata) -> np.ndarray:
 
 
 def _samples(store: _Store, what: str, time_s: np.ndarray) -> tuple[SampleStream, ...]:
+    """The rows of state or actions; nothing where there is no such array."""
     values = store.load(what)
     if values is None:
         return ()
@@ -162,6 +168,7 @@ def _samples(store: _Store, what: str, time_s: np.ndarray) -> tuple[SampleStream
 
 
 def _known(path: Path, K: np.ndarray) -> Metadata:
+    """The intrinsics that a matrix tells."""
     K = np.asarray(K, float)
     if K.shape[-2:] != (3, 3):
         raise DataError(f"{path}: the intrinsics have the shape {K.shape}, expected (3, 3)")

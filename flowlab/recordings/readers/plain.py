@@ -78,6 +78,7 @@ def open3d_calibration(path: Path) -> tuple[tuple[str, Metadata], ...]:
 
 
 def _list(path: Path, what: str, folder: str, suffixes: tuple[str, ...]) -> list[Path]:
+    """The pictures of a folder, of which there must be some."""
     if not (path / folder).is_dir():
         raise DataError(
             f"{path}: has no folder '{folder}'; name that of the {what} pictures in {FILE_NAME}, '{what}: ...'"
@@ -89,6 +90,7 @@ def _list(path: Path, what: str, folder: str, suffixes: tuple[str, ...]) -> list
 
 
 def _timed(file: Path, pictures: list[Path]) -> Float64[np.ndarray, "N"]:
+    """The times of pictures from a file."""
     time_s = load_times(file)
     if len(time_s) != len(pictures):
         raise DataError(

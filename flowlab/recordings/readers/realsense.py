@@ -139,6 +139,7 @@ def _drop_repeats(folder: Path) -> None:
 
 
 def _depth_of(color: Path) -> Path:
+    """The depth picture that belongs to a color picture."""
     return color.parent.with_name("depth") / f"{color.stem}.png"
 
 

@@ -56,14 +56,17 @@ class RH20TReader:
 
 
 def _has_pictures(folder: Path) -> bool:
+    """Whether it is the folder of a camera."""
     return (folder / "color").is_dir() and (folder / "depth").is_dir()
 
 
 def _cameras(episode: Path) -> list[Path]:
+    """The folders of the cameras of an episode."""
     return sorted(f for f in episode.glob("cam_*") if _has_pictures(f)) if episode.is_dir() else []
 
 
 def _choose(episode: Path, serial: str | None) -> Path:
+    """The folder of the camera that is asked for, or of the only one."""
     cameras = _cameras(episode)
     if not cameras:
         raise DataError(f"{episode}: has no folder cam_<serial> with color/ and depth/ in it")
@@ -80,6 +83,7 @@ def _choose(episode: Path, serial: str | None) -> Path:
 
 
 def _about(file: Path) -> dict[str, Any]:
+    """What ``metadata.json`` says that matters here."""
     if not file.is_file():
         return {}
     try:
@@ -111,6 +115,7 @@ def _state(folders: list[Path]) -> tuple[SampleStream, ...]:
 
 
 def _rows(files: list[Path]) -> np.ndarray:
+    """The arrays of files as rows of one width."""
     rows: list[np.ndarray] = []
     for file in files:
         try:

@@ -129,6 +129,7 @@ def _prefer(topics: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int]) -> str:
+    """The only topic; several, or none, are refused with the choices."""
     if len(topics) == 1:
         return topics[0]
     where = f"{bag.path.with_suffix('.yaml').name if bag.path.is_file() else FILE_NAME} or the calibration file"
@@ -223,4 +224,5 @@ class _Topic:
 
 
 def _picture(topic: _Topic, order: np.ndarray, i: int) -> np.ndarray:
+    """Decode the i-th picture of a topic in the order of time."""
     return decode_image(topic.bag.message(topic.name, topic.index, int(order[i])))

@@ -96,11 +96,14 @@ class RosBag:
         raise DataError(f"{self.path}: {topic} has lost its message {i} since it was opened")
 
     def _connections(self, topic: str) -> "list[Connection]":
+        """The connections of a topic."""
         return [c for c in self._reader.connections if c.topic == topic]
 
     def _count(self, topic: str) -> int:
+        """How many messages a topic has."""
         return self._reader.topics[topic].msgcount
 
 
 def _words(error: BaseException) -> str:
+    """What an error says, on one line."""
     return " ".join(str(error).split()) or type(error).__name__

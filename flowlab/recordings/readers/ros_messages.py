@@ -65,6 +65,7 @@ def decode_image(message: Any) -> np.ndarray:
 
 
 def _decode_compressed(message: Any) -> np.ndarray:
+    """RGB or depth counts of a CompressedImage."""
     content = np.asarray(message.data, np.uint8).tobytes()
     if not is_depth(message):
         return decode_color(content)
@@ -132,6 +133,7 @@ def relative_pose(transforms: Iterable[Any], to: str, frm: str) -> np.ndarray | 
 
 
 def _matrix(transform: Any) -> np.ndarray:
+    """A Transform as a matrix (4, 4)."""
     q, t = transform.rotation, transform.translation
     x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / np.linalg.norm([q.x, q.y, q.z, q.w])
     R = np.array([

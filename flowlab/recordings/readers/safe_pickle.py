@@ -23,6 +23,7 @@ class _Unpickler(pickle.Unpickler):
     """Makes arrays, numbers, text and mappings of them; a pickle that asks for more is refused."""
 
     def find_class(self, module: str, name: str) -> Any:
+        """A class or function that may be used; all others are refused."""
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}")
         return super().find_class(module, name)

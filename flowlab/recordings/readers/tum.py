@@ -64,10 +64,12 @@ class TUMReader:
 
 
 def _both(path: Path) -> bool:
+    """Whether both lists are there."""
     return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
 
 def _associations(path: Path) -> Path | None:
+    """The file of associations; None where there is none."""
     return next((path / name for name in ASSOCIATIONS if (path / name).is_file()), None)
 
 

@@ -58,6 +58,7 @@ def _write_steps(group: zarr.Group, dataset: Dataset, start: dict[tuple[str, int
 
 
 def _create(group: zarr.Group, key: str, shape: tuple[int, ...], dtype: str) -> "zarr.Array[Any]":
+    """An array as DP3's script makes it."""
     compressor = Blosc(cname="zstd", clevel=3, shuffle=Blosc.SHUFFLE)
     chunks = (min(_ROWS_TO_A_CHUNK, shape[0]), *shape[1:])
     return group.create_array(key, shape=shape, chunks=chunks, dtype=dtype, compressors=compressor)

@@ -75,6 +75,7 @@ class DP3Store:
             yield self._episode(k, start, stop)
 
     def _episode(self, k: int, start: int, stop: int) -> Episode:
+        """The k-th episode, whose rows are known."""
         state, action, point_cloud = (self._numbers(name, k, start, stop) for name in _DATA)
         steps = stop - start
         nowhere = np.zeros((0, 3), np.float32)
@@ -108,12 +109,14 @@ class DP3Store:
         return values
 
     def _read(self, name: str, start: int, stop: int) -> np.ndarray:
+        """Rows of an array; a damaged chunk is a :class:`DataError`."""
         try:
             return np.asarray(self._arrays[name][start:stop])
         except (ValueError, RuntimeError, OSError) as error:
             raise DataError(f"{self.path}/{name}: damaged ({first_line(error)}); {_REDO}") from error
 
     def _open_group(self) -> zarr.Group:
+        """The group of the store."""
         try:
             return zarr.open_group(self.path, mode="r", zarr_format=2)
         except FileNotFoundError as error:
@@ -143,6 +146,7 @@ class DP3Store:
         return sorted(str(f.parent.relative_to(self.path)) for f in self.path.glob("*/*/.zarray"))
 
     def _check_shapes(self) -> None:
+        """Refuse arrays that are not of one set of steps."""
         for name, dimensions in _DATA.items():
             shape = self._arrays[name].shape
             if len(shape) != dimensions or 0 in shape[1:]:

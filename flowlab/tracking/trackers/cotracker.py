@@ -52,6 +52,7 @@ class CoTracker(PretrainedTracker):
     @field_validator("support_grid")
     @classmethod
     def _has_a_choice(cls, value: bool, info: ValidationInfo) -> bool:
+        """Refuse a grid where the mode has its own."""
         if value and info.data.get("mode") != "online":
             raise ValueError("is for mode 'online'; 'offline' always has its grid")
         return value
@@ -78,6 +79,7 @@ class CoTracker(PretrainedTracker):
         return _Offline(network, clip, device)
 
     def _from_package(self) -> Any:
+        """The predictor of an installed package."""
         try:
             code = importlib.import_module("cotracker.predictor")
             predictor = code.CoTrackerOnlinePredictor if self.mode == "online" else code.CoTrackerPredictor
@@ -89,6 +91,7 @@ class CoTracker(PretrainedTracker):
             ) from error
 
     def _from_hub(self, repo: str) -> Any:
+        """The predictor through torch.hub."""
         import torch
 
         hub: Any = torch.hub
@@ -149,12 +152,14 @@ class _Offline(PretrainedSession):
         return self._video[:, start:stop].to(self._device).float()
 
     def _queries(self, queries_txy: np.ndarray) -> Any:
+        """Queries as a tensor."""
         import torch
 
         return torch.from_numpy(queries_txy)[None].to(self._device)
 
     @staticmethod
     def _tracks(xy: Any, visible: Any) -> Tracks2D:
+        """Tracks of the tensors that a predictor gives."""
         seen = visible[0].cpu().numpy()
         return Tracks2D(xy[0].float().cpu().numpy(), seen, seen.astype(np.float32))
 

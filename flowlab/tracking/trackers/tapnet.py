@@ -122,6 +122,7 @@ class _Square(PretrainedSession):
         return self._video[:, start:stop].to(self._device).float() / 127.5 - 1
 
     def _queries_tyx(self, queries_txy: np.ndarray) -> Any:
+        """Queries in raster coordinates, as a tensor."""
         import torch
 
         raster_xy = (queries_txy[:, 1:] + 0.5) * self._scale
@@ -182,9 +183,11 @@ class _Tapir(_Square):
         return self._sliced(start - kept.start, stop - kept.start)
 
     def _encoded(self, start: int, stop: int) -> Any:
+        """Feature grids, computed."""
         return self._network.get_feature_grids(self._frames(start, stop), is_training=False)
 
     def _sliced(self, a: int, b: int | None) -> Any:
+        """Some frames of the feature grids that are kept."""
         return self._grids._replace(**{k: tuple(g[:, a:b] for g in getattr(self._grids, k)) for k in _GRIDS})
 
 

@@ -61,9 +61,11 @@ class PretrainedTracker(Tracker):
         return {**super().describe(), "weights": {"source": source, "sha256": _sha256(self._file())}}
 
     def _file(self) -> Path:
+        """The file of weights, downloaded if need be."""
         return self.weights or _downloaded(self.name, self.weights_url)
 
     def _device(self) -> str:
+        """The device that the options ask for."""
         import torch
 
         if self.device == "cuda" and not torch.cuda.is_available():
@@ -146,6 +148,7 @@ def _loaded(tracker: PretrainedTracker) -> Any:
 
 @cache
 def _show_license(name: str, terms: str) -> None:
+    """Log whose work a network is, the first time."""
     _LOG.warning("flowlab: tracker '%s' is the work of others, license: %s", name, terms)
 
 
@@ -168,6 +171,7 @@ def _downloaded(name: str, url: str) -> Path:
 
 @lru_cache(maxsize=4)
 def _sha256(file: Path) -> str:
+    """The SHA-256 of a file."""
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
 

@@ -16,13 +16,13 @@ SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
 
 
 @numba.njit(cache=True, inline="always")
-def tolerance(z):
+def tolerance(z) -> float:
     """How far a depth reading may lie from a surface at depth z [m]."""
     return SURFACE_TOLERANCE * max(1.0, z * z)
 
 
 @numba.njit(cache=True)
-def color_cost(feature, u, v, f0):
+def color_cost(feature, u, v, f0) -> float:
     """Difference, 0 to 1, between a feature picture (H, W, 4) at a sub-pixel position and four channel values."""
     height, width = feature.shape[:2]
     u = min(max(u, 0.0), width - 1.001)
@@ -39,7 +39,7 @@ def color_cost(feature, u, v, f0):
 
 
 @numba.njit(cache=True)
-def features_at(feature, uv):
+def features_at(feature, uv) -> np.ndarray:
     """The four channels (n, 4) at sub-pixel positions (n, 2)."""
     height, width = feature.shape[:2]
     out = np.empty((len(uv), 4), np.float32)
@@ -55,7 +55,7 @@ def features_at(feature, uv):
 
 
 @numba.njit(cache=True, fastmath=True)
-def energies(points, point_features, R, t, depth, feature, K, every):
+def energies(points, point_features, R, t, depth, feature, K, every) -> tuple[np.ndarray, np.ndarray]:
     """How badly each body at each candidate pose explains a frame.
 
     points (B, n, 3), point_features (B, n, 4), R (B, C, 3, 3), t (B, C, 3); of the points each ``every``-th is
@@ -98,7 +98,7 @@ def energies(points, point_features, R, t, depth, feature, K, every):
 
 
 @numba.njit(cache=True)
-def motion_costs(points, point_features, frames, R, t, depth, feature, K):
+def motion_costs(points, point_features, frames, R, t, depth, feature, K) -> tuple[np.ndarray, np.ndarray]:
     """How badly each of B motions explains each of n frame-0 points, over some frames.
 
     points (n, 3), point_features (n, 4), frames (F,), R (B, T, 3, 3), t (B, T, 3), depth (T, H, W),
@@ -139,7 +139,7 @@ def motion_costs(points, point_features, frames, R, t, depth, feature, K):
 
 
 @numba.njit(cache=True)
-def nearest_reading(depth, u, v, z):
+def nearest_reading(depth, u, v, z) -> tuple[float, float, float]:
     """Of the readings in the 3x3 pixels around (u, v): how near the closest comes to z (among the center's,
     the least and the greatest), the least, and the greatest; 0 where there is none."""
     height, width = depth.shape
@@ -157,7 +157,7 @@ def nearest_reading(depth, u, v, z):
 
 
 @numba.njit(cache=True)
-def residuals(depth, feature, point_features, uv, z):
+def residuals(depth, feature, point_features, uv, z) -> np.ndarray:
     """How badly color and depth fit points at pixels (T, M, 2) and depths (T, M) [m]: 0 to 1, -1 where no depth."""
     out = np.full(z.shape, -1.0)
     for t in range(z.shape[0]):
@@ -170,7 +170,7 @@ def residuals(depth, feature, point_features, uv, z):
 
 
 @numba.njit(cache=True)
-def inlier_shares(R, t, start, path, known, within):
+def inlier_shares(R, t, start, path, known, within) -> np.ndarray:
     """Share of a point's known frames (N,) in which a motion R (F, 3, 3), t (F, 3) carries it along its path.
 
     start (N, 3), path (F, N, 3), known (F, N), within (F, N) [m].

@@ -12,7 +12,7 @@ _GRAY_SCALE, _DEPTH_SCALE = 12.0, 0.004
 
 
 @numba.njit(cache=True)
-def align(points, lightness, R, t, lightness_picture, smooth, normal, K, iterations):
+def align(points, lightness, R, t, lightness_picture, smooth, normal, K, iterations) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton of every body's pose against one frame: lightness and distance to the surface, robustly.
 
     points (B, n, 3), lightness (B, n), R (B, 3, 3), t (B, 3); ``lightness_picture`` and ``smooth`` (H, W)
@@ -39,7 +39,7 @@ def align(points, lightness, R, t, lightness_picture, smooth, normal, K, iterati
 
 
 @numba.njit(cache=True)
-def _compare(points, lightness, R, t, lightness_picture, smooth, K, X, gray):
+def _compare(points, lightness, R, t, lightness_picture, smooth, K, X, gray) -> tuple[int, np.ndarray]:
     """Find the points that the pose puts on the surface that is seen there; how many, and their center.
 
     Fills in ``X`` (n, 3), where they are [m], and ``gray`` (n, 3): how much lighter the picture is there, and how
@@ -68,7 +68,7 @@ def _compare(points, lightness, R, t, lightness_picture, smooth, K, X, gray):
 
 
 @numba.njit(cache=True, inline="always")
-def _value_and_gradient(picture, u, v):
+def _value_and_gradient(picture, u, v) -> tuple[float, float, float]:
     """A picture between its pixels: its value, and its central differences interpolated alike."""
     i, j = int(v), int(u)
     a, b = u - j, v - i
@@ -82,7 +82,7 @@ def _value_and_gradient(picture, u, v):
 
 
 @numba.njit(cache=True)
-def _normal_equations(X, gray, center, smooth, normal, K):
+def _normal_equations(X, gray, center, smooth, normal, K) -> tuple[np.ndarray, np.ndarray, float]:
     """H (6, 6) and g (6,) of a rotation about the center and a translation, and the squared spread of the points."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     brighter = np.median(gray[:, 0])  # the light may change as a whole
@@ -110,7 +110,7 @@ def _normal_equations(X, gray, center, smooth, normal, K):
 
 
 @numba.njit(cache=True)
-def _damped_step(H, g, spread, m):
+def _damped_step(H, g, spread, m) -> np.ndarray:
     """The step (6,) of ``m`` points, damped, so that what the frame does not tell stays as it was."""
     extent = max(np.sqrt(spread / m / 3), 0.01)
     for a in range(3):
@@ -120,7 +120,7 @@ def _damped_step(H, g, spread, m):
 
 
 @numba.njit(cache=True, inline="always")
-def _accumulate(H, g, rx, ry, rz, jx, jy, jz, r, w):
+def _accumulate(H, g, rx, ry, rz, jx, jy, jz, r, w) -> None:
     """Add one residual, whose derivative by the point's position is (jx, jy, jz), to the normal equations."""
     a = (ry * jz - rz * jy, rz * jx - rx * jz, rx * jy - ry * jx, jx, jy, jz)
     for i in range(6):
@@ -130,7 +130,7 @@ def _accumulate(H, g, rx, ry, rz, jx, jy, jz, r, w):
 
 
 @numba.njit(cache=True)
-def _rotation(w):
+def _rotation(w) -> np.ndarray:
     """The rotation (3, 3) by a rotation vector."""
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2) + 1e-12
     x, y, z = w[0] / angle, w[1] / angle, w[2] / angle

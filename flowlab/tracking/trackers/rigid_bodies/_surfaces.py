@@ -11,7 +11,7 @@ from flowlab.tracking.trackers.rigid_bodies._costs import A, B, L, tolerance
 
 
 @numba.njit(cache=True)
-def smooth_depth(depth):
+def smooth_depth(depth) -> np.ndarray:
     """3x3 mean over readings within 1.5 cm [at up to 1 m] of the center; holes stay holes."""
     height, width = depth.shape
     out = np.zeros_like(depth)
@@ -31,7 +31,7 @@ def smooth_depth(depth):
 
 
 @numba.njit(cache=True)
-def surface_normals(depth, K, reach=2):
+def surface_normals(depth, K, reach=2) -> np.ndarray:
     """Normals (H, W, 3) in 1/127 of a depth picture, by differences over ``reach`` pixels; 0 at edges and holes."""
     height, width = depth.shape
     out = np.zeros((height, width, 3), np.int8)
@@ -57,7 +57,7 @@ def surface_normals(depth, K, reach=2):
 
 
 @numba.njit(cache=True, fastmath=True)
-def aggregate(cost, wanted, valid, depth, feature, reach, depth_scale, color_scale, space_scale):
+def aggregate(cost, wanted, valid, depth, feature, reach, depth_scale, color_scale, space_scale) -> np.ndarray:
     """Bilateral mean of a cost volume (B, h, w) over neighbors at the same depth and of the same color.
 
     depth (h, w), feature (h, w, 4) uint8, valid and wanted (h, w). Returns (B, h, w): infinite where not valid,
@@ -93,7 +93,7 @@ def aggregate(cost, wanted, valid, depth, feature, reach, depth_scale, color_sca
 
 
 @numba.njit(cache=True)
-def is_seen(depth, uv, z):
+def is_seen(depth, uv, z) -> np.ndarray:
     """Whether depth pictures (T, H, W) have a reading like z (T, M) [m] around pixels (T, M, 2), or none at all."""
     height, width = depth.shape[1:]
     out = np.zeros(z.shape, np.bool_)
@@ -111,7 +111,7 @@ def is_seen(depth, uv, z):
 
 
 @numba.njit(cache=True)
-def depth_offsets(depth, uv, z):
+def depth_offsets(depth, uv, z) -> np.ndarray:
     """How far beyond points at pixels (T, M, 2) and depths (T, M) [m] the surface is read: the mean of the readings
     around that are nearly as deep, not a number where there is none."""
     height, width = depth.shape[1:]

@@ -97,6 +97,7 @@ def extract_features(clip: Clip, max_depth: float) -> ClipFeatures:
 
 
 def _feature(rgb: np.ndarray, factor: int, offset: int) -> np.ndarray:
+    """The feature picture (h, w, 4) of a color picture."""
     if factor > 1:
         rgb = cv2.GaussianBlur(rgb, (0, 0), 0.5 * factor)[offset::factor, offset::factor]
     smooth = cv2.GaussianBlur(rgb, (0, 0), _BLUR)

@@ -56,7 +56,7 @@ def neighbors(fit: RigidBodyFit) -> list[tuple[int, int]]:
         touch = (a > 0) & (b > 0) & (a != b) & (np.abs(z[near] - z[far]) < 0.03)
         np.add.at(border, (a[touch], b[touch]), 1)
     border = np.triu(border + border.T)
-    pairs = [(int(a), int(b)) for a, b in np.argwhere(border >= 2) if _move_alike(fit, owner, a, b)]
+    pairs = [(a, b) for a, b in np.argwhere(border >= 2).tolist() if _move_alike(fit, owner, a, b)]
     return sorted(pairs, key=lambda p: -border[p])
 
 
@@ -73,7 +73,7 @@ def _merit(fit: RigidBodyFit, owner: Int64[np.ndarray, "h w"], pair: tuple[int, 
     uv = fit.grid.pixels(region)
     xyz = fit.pictures.unproject(uv.astype(float), fit.grid.depth[region].astype(float))
     motions = [fit.bodies[a - 1].motion, fit.bodies[b - 1].motion, motion]
-    cost = motion_costs(fit.pictures, motions, uv, xyz, motion_penalty=0)
+    cost = motion_costs(fit.pictures, motions, uv, xyz, motion_penalty=0.0)
     return float((np.where(owner[region] == a, cost[0], cost[1]) - cost[2]).mean())
 
 

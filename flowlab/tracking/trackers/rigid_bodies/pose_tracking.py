@@ -75,6 +75,7 @@ class _BodyBatch:
 
 
 def _sample(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of the pixels a body of n is tracked by."""
     if n == _POINTS_PER_BODY:
         return np.arange(n)
     return rng.choice(n, _POINTS_PER_BODY, replace=n < _POINTS_PER_BODY)
@@ -155,6 +156,7 @@ class _BestPoses:
 
 
 def _rotate(R: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) turned by rotations (..., 3, 3)."""
     return (R @ s[..., None])[..., 0]
 
 
@@ -170,6 +172,7 @@ def _choose(
 def _evaluate(
     batch: _BodyBatch, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Poses with their energies and seen shares."""
     energy, seen = batch.energies(t, R[:, None], s[:, None], of)
     return R, s, energy[:, 0], seen[:, 0]
 

@@ -74,6 +74,7 @@ def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np
 
 
 def _residual(fit: RigidBodyFit, uv: np.ndarray, path: np.ndarray, seen: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """How badly every frame fits (T, M), where the point is seen; its cost where not."""
     features = _costs.features_at(fit.pictures.feature[0], uv.astype(np.float32))
     p = fit.pictures
     now = _costs.residuals(p.depth, p.feature, features, p.project(path), path[..., 2])

@@ -165,4 +165,5 @@ class _Ransac:
         return index[self._shares(R, t, index) > _INLIER]
 
     def _shares(self, R: np.ndarray, t: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Share of their frames in which trajectories follow a motion."""
         return inlier_shares(R, t, self.start[of], self._path[:, of], self._known[:, of], self._within[:, of])
