@@ -221,7 +221,14 @@ class Demonstration(Record, ABC):
 
     @abstractmethod
     def frame(self, t: int) -> Frame:
-        """The picture taken at step ``t``, before action ``t``."""
+        """The picture taken at step ``t``, before action ``t``.
+
+        Args:
+            t: The step, from 0.
+
+        Returns:
+            Depth [m], and color and owners where they are known.
+        """
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -30,11 +30,19 @@ class Camera(Record):
     """Camera pose: maps camera coordinates to world coordinates [m]."""
 
     def lengths(self) -> dict[str | int, int]:
-        """Of its pictures: height and width."""
+        """Of its pictures: height and width.
+
+        Returns:
+            The length of ``H`` and ``W`` [px].
+        """
         return {"H": self.height, "W": self.width}
 
     def sizes(self) -> dict[str, Size]:
-        """Of its pictures, too: height and width."""
+        """Of its pictures, too: height and width.
+
+        Returns:
+            Every named dimension, and which field says its length.
+        """
         own = {"H": Size(self.height, "height"), "W": Size(self.width, "width")}
         return {**Record.sizes(self), **own}
 
@@ -65,7 +73,17 @@ class Camera(Record):
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float, T_world_cam: np.ndarray) -> "Camera":
-        """A centered camera with square pixels and the vertical field of view ``fovy_deg``."""
+        """A centered camera with square pixels.
+
+        Args:
+            width: Of its pictures [px].
+            height: Of its pictures [px].
+            fovy_deg: Vertical field of view [degrees].
+            T_world_cam: Its pose (4, 4): maps camera coordinates to world coordinates [m].
+
+        Returns:
+            The camera, whose optical axis passes through the middle of the picture.
+        """
         f = 0.5 * height / np.tan(np.deg2rad(fovy_deg) / 2)
         K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
         return cls(width, height, K, T_world_cam)
@@ -73,7 +91,15 @@ class Camera(Record):
     def project(
         self, xyz_world: Num[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
-        """Pixel coordinates (u, v) [px] and z-depth [m] of world points; z <= 0 is behind the camera."""
+        """Where world points are in the picture.
+
+        Args:
+            xyz_world: Points in the world frame [m].
+
+        Returns:
+            Their pixel coordinates (u, v) [px], which may lie outside the picture, and their z-depth [m]; a point with
+            z <= 0 is behind the camera, and its pixel means nothing.
+        """
         R, t = self.T_world_cam[:3, :3], self.T_world_cam[:3, 3]
         xyz_cam = (xyz_world - t) @ R
         z = xyz_cam[..., 2]
@@ -82,14 +108,26 @@ class Camera(Record):
         return uv, z
 
     def unproject(self, uv: Num[np.ndarray, "*batch 2"], z: Num[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
-        """World points [m] at pixel coordinates (u, v) [px] and z-depth [m]."""
+        """The inverse of :meth:`project`.
+
+        Args:
+            uv: Pixel coordinates (u, v) [px].
+            z: Depth along the optical axis [m].
+
+        Returns:
+            Points in the world frame [m].
+        """
         u = (uv[..., 0] - self.K[0, 2]) / self.K[0, 0]
         v = (uv[..., 1] - self.K[1, 2]) / self.K[1, 1]
         xyz_cam = np.stack([u, v, np.ones_like(u)], -1) * np.asarray(z)[..., None]
         return xyz_cam @ self.T_world_cam[:3, :3].T + self.T_world_cam[:3, 3]
 
     def to_json(self) -> dict[str, Any]:
-        """The camera as plain JSON values."""
+        """The camera as plain JSON values.
+
+        Returns:
+            ``width``, ``height``, ``K`` and ``T_world_cam``, matrices row by row.
+        """
         return {
             "width": self.width,
             "height": self.height,
@@ -99,7 +137,14 @@ class Camera(Record):
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Camera":
-        """The inverse of :meth:`to_json`."""
+        """The inverse of :meth:`to_json`.
+
+        Args:
+            values: What :meth:`to_json` gives.
+
+        Returns:
+            The camera.
+        """
         return cls(
             values["width"], values["height"], np.array(values["K"], float), np.array(values["T_world_cam"], float)
         )

@@ -34,7 +34,7 @@ def farthest_points(
 
 
 @numba.njit(cache=True)
-def _cells(xyz, cells_per_axis):  # type: ignore[no-untyped-def]
+def _cells(xyz, cells_per_axis) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
     """Counting sort of the points into cubic cells: order (N,), start (C+1,) of the occupied cells."""
     n = len(xyz)
     low, high = xyz[0].copy(), xyz[0].copy()
@@ -68,7 +68,7 @@ def _cells(xyz, cells_per_axis):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _by_cell(xyz, order, start):  # type: ignore[no-untyped-def]
+def _by_cell(xyz, order, start) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
     """Points (3, N) in cell order, and the bounding boxes (6, C) of the cells: lows, then highs."""
     cells = len(start) - 1
     points, box = np.empty((3, len(xyz)), np.float32), np.empty((6, cells), np.float32)
@@ -83,7 +83,7 @@ def _by_cell(xyz, order, start):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _farthest(xyz, k, taken):  # type: ignore[no-untyped-def]
+def _farthest(xyz, k, taken) -> np.ndarray:  # type: ignore[no-untyped-def]
     order, start = _cells(xyz, max(1, int(math.sqrt(len(xyz) / POINTS_PER_CELL) * 1.25)))
     points, box = _by_cell(xyz, order, start)
     cells = len(start) - 1
@@ -113,7 +113,7 @@ def _farthest(xyz, k, taken):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _lowest_of_farthest(far_bits, far_index):  # type: ignore[no-untyped-def]
+def _lowest_of_farthest(far_bits, far_index) -> np.int64:  # type: ignore[no-untyped-def]
     """The lowest point index among the cells with the largest gap."""
     best = np.int32(-1)
     for c in range(len(far_bits)):
@@ -125,7 +125,7 @@ def _lowest_of_farthest(far_bits, far_index):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _bound(box, x, y, z, bound):  # type: ignore[no-untyped-def]
+def _bound(box, x, y, z, bound) -> None:  # type: ignore[no-untyped-def]
     """Squared distance to each box; rounding is monotonic, so no point inside is computed to be nearer."""
     zero = np.float32(0)
     x0, y0, z0, x1, y1, z1 = box[0], box[1], box[2], box[3], box[4], box[5]
@@ -137,7 +137,7 @@ def _bound(box, x, y, z, bound):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _update(px, py, pz, gap, x, y, z):  # type: ignore[no-untyped-def]
+def _update(px, py, pz, gap, x, y, z) -> tuple[np.float32, int]:  # type: ignore[no-untyped-def]
     """Lower the gaps of one cell's points to their distance from a new one; the largest left, and its place."""
     for j in range(len(gap)):
         dx, dy, dz = px[j] - x, py[j] - y, pz[j] - z

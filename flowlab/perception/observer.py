@@ -115,7 +115,7 @@ def pad(xyz: np.ndarray, size: int, padding: str = "repeat") -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _unproject_and_crop(depth, owner, kept, K, T_world_cam, low, high):  # type: ignore[no-untyped-def]
+def _unproject_and_crop(depth, owner, kept, K, T_world_cam, low, high) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
     """Points of all kept pixels strictly inside the box: xyz (P, 3) float32, pixel (P,) int32."""
     height, width = depth.shape
     xyz = np.empty((height * width, 3), np.float32)

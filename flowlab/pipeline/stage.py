@@ -42,7 +42,17 @@ class Stage(Settings):
     """The kind of demonstration the stage can work on, where not every kind will do."""
 
     def process(self, record: Any) -> Any:
-        """Turn a record into the next; raise :class:`Rejected` to keep it out of the dataset."""
+        """Turn a record into the next. A subclass says by its annotations which records these are.
+
+        Args:
+            record: What the stage before this one made; the first gets an :class:`EpisodeRequest`.
+
+        Returns:
+            The next record, a new one.
+
+        Raises:
+            Rejected: The record is kept out of the dataset, for the reason given.
+        """
         raise NotImplementedError
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:
@@ -59,12 +69,20 @@ class Stage(Settings):
 
     @classmethod
     def takes(cls) -> type:
-        """The type of record the stage works on."""
+        """The type of record the stage works on.
+
+        Returns:
+            What ``process`` is annotated to take.
+        """
         return cls._types()[0]
 
     @classmethod
     def gives(cls) -> type:
-        """The type of record the stage makes."""
+        """The type of record the stage makes.
+
+        Returns:
+            What ``process`` is annotated to return.
+        """
         return cls._types()[1]
 
     @classmethod

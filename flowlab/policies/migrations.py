@@ -16,6 +16,8 @@ _SPEC = {"normaliser": "normalizer", "layout": "channels"}
 _CHANNELS = {"state_places": "state_positions", "action_place": "action_position"}
 _MOTION_OF_ALL = {"condition", "condition_noise", "weight", "features", "denoiser"}
 """Settings of a motion that every policy has which predicts one; the others were 3D FDP's alone."""
+_OLD_OPTIMIZER = "optimiser"
+"""What resume files of format 1 call it."""
 _TENSORS = (
     (r"^places\.", "query_encoder."),
     (r"^motion\.project\.", "motion.query_projection."),
@@ -61,7 +63,7 @@ def migrate_tensor(name: str) -> str:
     prefix, weight = re.fullmatch(r"(.*[:/])?(.*)", name).groups("")  # type: ignore[union-attr]
     for pattern, replacement in _TENSORS:
         weight = re.sub(pattern, replacement, weight)
-    return prefix.replace("optimiser:", "optimizer:") + weight
+    return prefix.replace(f"{_OLD_OPTIMIZER}:", "optimizer:") + weight
 
 
 def _renamed(values: Any, names: Mapping[str, str]) -> Any:

@@ -53,7 +53,7 @@ def _rays(pixels: np.ndarray, camera: Intrinsics) -> np.ndarray:
     return cv2.undistortPoints(flat, camera.K, np.array(camera.distortion or (0.0,) * 5)).reshape(pixels.shape)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _splat(depth, corners, centers, T, K, width, height) -> np.ndarray:  # type: ignore[no-untyped-def]
     """z-buffer of depth pixels as squares: float32 (height, width)."""
     seen = np.zeros((height, width), np.float32)

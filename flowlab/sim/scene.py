@@ -55,7 +55,9 @@ class Scene:
     Geoms of ``hidden_bodies`` are moved to a group of the model that no renderer draws.
     """
 
-    def __init__(self, model: mujoco.MjModel, *, markers: bool = True, hidden_bodies: frozenset[str] = frozenset()):
+    def __init__(
+        self, model: mujoco.MjModel, *, markers: bool = True, hidden_bodies: frozenset[str] = frozenset()
+    ) -> None:
         self.model = model
         self.markers = markers
         bodies = [_root_chain(model, b) for b in range(model.nbody)]

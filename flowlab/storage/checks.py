@@ -26,7 +26,7 @@ OFF_SURFACE_SHARE_ESTIMATED = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class ArrayProblem:
     """Something wrong with one array."""
 
     array: str
@@ -34,46 +34,48 @@ class Problem:
     what: str
 
 
-def episode_problems(e: Episode, provenance: Provenance) -> Iterator[Problem]:
+def episode_problems(e: Episode, provenance: Provenance) -> Iterator[ArrayProblem]:
     """Everything wrong with an episode that comes from where ``provenance`` says."""
     for spec in SCHEMA:
         values = spec.of(e) if spec.dtype.startswith("float") else None
         if values is not None and not np.isfinite(values).all():
             row = int(np.argwhere(~np.isfinite(values))[0][0])
-            yield Problem(spec.path, f"not finite at step {row}" if spec.per_step else "not finite")
+            yield ArrayProblem(spec.path, f"not finite at step {row}" if spec.per_step else "not finite")
             return
     for check in _CHECKS:
         yield from check(e)
     if provenance.tracks == "estimated" and e.tracks.quality is None:
-        yield Problem("data/sigma", "missing; estimated tracks must state their error")
+        yield ArrayProblem("data/sigma", "missing; estimated tracks must state their error")
     if provenance.action_limits is not None:
         yield from _beyond_limits(e.action, *map(np.array, provenance.action_limits))
 
 
-def _beyond_limits(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[Problem]:
+def _beyond_limits(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[ArrayProblem]:
     """Actions as executed lie within their limits."""
     if action.shape[1] != len(low):
-        yield Problem("data/action", f"has {action.shape[1]} numbers a step, and limits are known of {len(low)}")
+        yield ArrayProblem("data/action", f"has {action.shape[1]} numbers a step, and limits are known of {len(low)}")
         return
     beyond = np.maximum(action - high, low - action)
     t, k = np.unravel_index(beyond.argmax(), beyond.shape)
     if beyond[t, k] > 0:
         limits = f"[{low[k]:g}, {high[k]:g}]"
-        yield Problem("data/action", f"reaches {action[t, k]:.3g} at step {t}; actions as executed lie in {limits}")
+        yield ArrayProblem(
+            "data/action", f"reaches {action[t, k]:.3g} at step {t}; actions as executed lie in {limits}"
+        )
 
 
-def _teleports(e: Episode) -> Iterator[Problem]:
+def _teleports(e: Episode) -> Iterator[ArrayProblem]:
     step = np.linalg.norm(e.flow[:-1], axis=-1)
     if e.tracks.quality is not None:
         yield from _estimated_teleports(e, step)
     elif step.size and step.max() > TELEPORT:
         t, m = np.unravel_index(step.argmax(), step.shape)
-        yield Problem(
+        yield ArrayProblem(
             "data/tracks", f"point {m} jumps {step.max():.3f} m after step {t}; at most {TELEPORT} is possible"
         )
 
 
-def _estimated_teleports(e: Episode, step: np.ndarray) -> Iterator[Problem]:
+def _estimated_teleports(e: Episode, step: np.ndarray) -> Iterator[ArrayProblem]:
     """Only points that were followed through a step can jump in it; one that comes back from hiding may be anywhere."""
     quality = e.tracks.quality
     assert quality is not None
@@ -83,14 +85,14 @@ def _estimated_teleports(e: Episode, step: np.ndarray) -> Iterator[Problem]:
     far = known & (step > possible + 3 * (quality.sigma[1:] + quality.sigma[:-1]))
     if far.sum() > JUMPING_SHARE * known.sum():
         t, m = np.unravel_index(np.where(far, step, 0).argmax(), step.shape)
-        yield Problem(
+        yield ArrayProblem(
             "data/tracks",
             f"{far.sum()} of {known.sum()} steps of visible points are jumps that their stated errors do not explain; "
             f"the farthest, of point {m} after step {t}, is {step[t, m]:.3f} m",
         )
 
 
-def _quality(e: Episode) -> Iterator[Problem]:
+def _quality(e: Episode) -> Iterator[ArrayProblem]:
     """Estimated tracks state an error, and claim to be measured only where something was."""
     quality = e.tracks.quality
     if quality is None:
@@ -114,27 +116,31 @@ def _quality(e: Episode) -> Iterator[Problem]:
     for name, (where, what) in wrong.items():
         if where.any():
             t, m = np.argwhere(where)[0]
-            yield Problem(f"data/{name}", f"point {m} at step {t} {what}, and so are {where.sum() - 1} more")
+            yield ArrayProblem(f"data/{name}", f"point {m} at step {t} {what}, and so are {where.sum() - 1} more")
 
 
-def _times(e: Episode) -> Iterator[Problem]:
+def _times(e: Episode) -> Iterator[ArrayProblem]:
     if not (np.diff(e.time_s) > 0).all():
-        yield Problem("data/time", f"does not rise after step {int((np.diff(e.time_s) <= 0).argmax())}")
+        yield ArrayProblem("data/time", f"does not rise after step {int((np.diff(e.time_s) <= 0).argmax())}")
 
 
-def _counts(e: Episode) -> Iterator[Problem]:
+def _counts(e: Episode) -> Iterator[ArrayProblem]:
     n = e.point_cloud.shape[1]
     if not ((e.point_count >= 1) & (e.point_count <= n)).all():
-        yield Problem("data/point_count", f"ranges from {e.point_count.min()} to {e.point_count.max()}, not 1 to {n}")
+        yield ArrayProblem(
+            "data/point_count", f"ranges from {e.point_count.min()} to {e.point_count.max()}, not 1 to {n}"
+        )
 
 
-def _anchors(e: Episode) -> Iterator[Problem]:
+def _anchors(e: Episode) -> Iterator[ArrayProblem]:
     gap = np.abs(np.linalg.norm(e.tracks.xyz_world[0] - e.queries.xyz_world, axis=-1) - e.tracks.association_distance)
     if gap.max() > 1e-4:
-        yield Problem("data/tracks", f"point {gap.argmax()} starts {gap.max() * 1e3:.2f} mm from where it was anchored")
+        yield ArrayProblem(
+            "data/tracks", f"point {gap.argmax()} starts {gap.max() * 1e3:.2f} mm from where it was anchored"
+        )
 
 
-def _off_surface(e: Episode) -> Iterator[Problem]:
+def _off_surface(e: Episode) -> Iterator[ArrayProblem]:
     """Visible points must lie on the cloud, as far as a sampled cloud can tell.
 
     A farthest-point sample leaves no point of its cloud farther away than its own least spacing, so a
@@ -157,11 +163,11 @@ def _off_surface(e: Episode) -> Iterator[Problem]:
         distance = np.asarray(tree.query(seen)[0]) - e.tracks.association_distance.max() - slack[t, inside]
         far, total = far + int((distance > spacing + OFF_SURFACE).sum()), total + len(seen)
     if far > (OFF_SURFACE_SHARE if quality is None else OFF_SURFACE_SHARE_ESTIMATED) * total:
-        yield Problem(
+        yield ArrayProblem(
             "data/tracks", f"{far} of {total} visible points lie off the surface; the labels do not fit the cloud"
         )
 
 
-_CHECKS: tuple[Callable[[Episode], Iterator[Problem]], ...] = (
+_CHECKS: tuple[Callable[[Episode], Iterator[ArrayProblem]], ...] = (
     _times, _teleports, _quality, _counts, _anchors, _off_surface,
 )  # fmt: skip

@@ -86,13 +86,27 @@ class Dataset(EpisodeSequence):
         return self.manifest.provenance
 
     def episode(self, index: int) -> Episode:
-        """The episode at a position of :attr:`refs`, from 0. Raises :class:`DataError` where there is none."""
+        """The episode at a position of :attr:`refs`.
+
+        Args:
+            index: Its position, from 0.
+
+        Returns:
+            The episode, all of its arrays read.
+
+        Raises:
+            DataError: There is no such episode, or its shard is damaged.
+        """
         if not 0 <= index < len(self):
             raise DataError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
         return self[index]
 
     def episodes(self) -> Iterator[Episode]:
-        """All episodes, shard by shard."""
+        """All episodes, shard by shard: the quickest order.
+
+        Yields:
+            Every episode that counts, all of its arrays read.
+        """
         for receipt in self.receipts:
             if receipt.accepted:
                 yield from Shard(self.path / receipt.shard).episodes()
@@ -113,7 +127,17 @@ class Dataset(EpisodeSequence):
         )  # fmt: skip
 
     def rejected(self, index: int) -> Episode:
-        """The episode at a position of :attr:`rejects`, where there is one to look at."""
+        """The episode at a position of :attr:`rejects`, where there is one to look at.
+
+        Args:
+            index: Its position, from 0.
+
+        Returns:
+            The episode as it was when it was rejected.
+
+        Raises:
+            DataError: There is no such reject, it was rejected before there was an episode, or its shard is damaged.
+        """
         if not 0 <= index < len(self.rejects):
             raise DataError(f"{self.path}: no reject {index}; there are {len(self.rejects)}, counted from 0")
         ref = self.rejects[index]

@@ -8,7 +8,7 @@ import numpy as np
 
 from flowlab.errors import DataError
 from flowlab.provenance import Provenance
-from flowlab.storage.checks import Problem, episode_problems
+from flowlab.storage.checks import ArrayProblem, episode_problems
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import MANIFEST, Receipt
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA
@@ -62,7 +62,7 @@ def _finding(path: Path, error: DataError) -> Finding:
     return Finding(place, problem) if separator else Finding(str(path), place)
 
 
-def _under(shard: str, problem: Problem, who: str = "") -> Finding:
+def _under(shard: str, problem: ArrayProblem, who: str = "") -> Finding:
     return Finding(f"{shard}/{problem.array}", who + problem.what)
 
 
@@ -118,10 +118,10 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard) -> Iterator[F
             yield Finding(place, f"seed {episode.seed}: content differs from what its receipt says; {_ANEW}")
 
 
-def _shape_problems(known: Provenance, columns: dict[str, np.ndarray], ends: np.ndarray) -> Iterator[Problem]:
+def _shape_problems(known: Provenance, columns: dict[str, np.ndarray], ends: np.ndarray) -> Iterator[ArrayProblem]:
     """Types and shapes against the schema, the provenance and each other."""
     if len(ends) == 0 or (np.diff(ends, prepend=0) <= 0).any():
-        yield Problem(EPISODE_ENDS, f"must rise from above 0, found {ends.tolist()[:8]}")
+        yield ArrayProblem(EPISODE_ENDS, f"must rise from above 0, found {ends.tolist()[:8]}")
         return
     sizes = {"time": int(ends[-1]), "episode": len(ends), "xyz": 3, "rgb": 3, "pose": 9}
     sizes |= {dim: made["points"] for dim, made in (("point", known.observer), ("query", known.queries)) if made}
@@ -130,7 +130,7 @@ def _shape_problems(known: Provenance, columns: dict[str, np.ndarray], ends: np.
             continue
         values = columns[spec.path]
         if values.dtype != spec.dtype:
-            yield Problem(spec.path, f"type is {values.dtype}, expected {spec.dtype}")
+            yield ArrayProblem(spec.path, f"type is {values.dtype}, expected {spec.dtype}")
         expected = tuple(sizes.setdefault(dim, n) for dim, n in zip(spec.dims, values.shape, strict=False))
         if values.shape != expected or len(values.shape) != len(spec.dims):
-            yield Problem(spec.path, f"shape is {values.shape}, expected {expected} for {', '.join(spec.dims)}")
+            yield ArrayProblem(spec.path, f"shape is {values.shape}, expected {expected} for {', '.join(spec.dims)}")

@@ -112,7 +112,7 @@ def _between(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return values
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _read(  # type: ignore[no-untyped-def]
     depth,
     xy,
@@ -161,7 +161,7 @@ def _read(  # type: ignore[no-untyped-def]
     return z, source, fits, hidden
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _own_reading(depth, u, v) -> float:  # type: ignore[no-untyped-def]
     """Depth at the nearest pixel; -1 outside the picture."""
     column, row = int(np.rint(u)), int(np.rint(v))
@@ -169,7 +169,7 @@ def _own_reading(depth, u, v) -> float:  # type: ignore[no-untyped-def]
     return np.float64(depth[row, column]) if inside else -1.0
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _readings(depth, u, v, window, around, distance) -> int:  # type: ignore[no-untyped-def]
     """Fill in the depths in the window around a point, and their pixels' distances from it; how many there are."""
     column, row = int(np.rint(u)), int(np.rint(v))
@@ -182,7 +182,7 @@ def _readings(depth, u, v, window, around, distance) -> int:  # type: ignore[no-
     return count
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _continuing(around, distance, last, nearness) -> float:  # type: ignore[no-untyped-def]
     """The reading that best continues depth ``last``, or the nearest where that is not known (0); inf if none."""
     best, cost = np.inf, np.inf
@@ -193,7 +193,7 @@ def _continuing(around, distance, last, nearness) -> float:  # type: ignore[no-u
     return best
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _layer_mean(around, distance, z, thickness, spread) -> float:  # type: ignore[no-untyped-def]
     """Mean of the readings that lie within ``thickness`` of depth ``z``, weighted by nearness to the point."""
     total, weight = 0.0, 0.0

@@ -41,7 +41,11 @@ class TrainedRun:
         return self.folder / CURVE
 
     def to_json(self) -> dict[str, Any]:
-        """The same as JSON values."""
+        """The same as JSON values.
+
+        Returns:
+            One JSON object, as ``flowlab train --json`` prints it.
+        """
         return {
             "run": str(self.folder),
             "policy": self.policy,

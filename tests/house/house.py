@@ -133,15 +133,12 @@ class House:
         """Of all files."""
         return tuple(f for source in self.sources for f in source.functions())
 
-    def undocumented(self, *, private: bool = False) -> list[str]:
-        """Modules, classes and functions without a docstring, private functions alone if asked for.
-
-        Nested and magic functions need none.
-        """
+    def undocumented(self) -> list[str]:
+        """Modules, classes and public functions without a docstring; nested and magic functions need none."""
         functions = [f for f in self.functions if not f.nested and not f.is_magic and not _overloaded(f.node)]
-        functions = [f for f in functions if f.is_private == private and not ast.get_docstring(f.node)]
+        functions = [f for f in functions if not f.is_private and not ast.get_docstring(f.node)]
         named = [f"{f.where} {f.name}" for f in functions]
-        return named if private else self._bare_modules_and_classes() + named
+        return self._bare_modules_and_classes() + named
 
     def _bare_modules_and_classes(self) -> list[str]:
         bare = [s.where() for s in self.sources if not ast.get_docstring(s.tree)]
@@ -337,7 +334,6 @@ def main() -> None:
         ("import circles", house.circles()),
         ("class names twice", house.twice()),
         ("public, without a docstring", house.undocumented()),
-        ("private, without a docstring", house.undocumented(private=True)),
         ("without a return annotation", house.unannotated()),
         ("exported, without a section", house.untold()),
         ("British words", british()),

@@ -12,7 +12,7 @@ PLANE, SPHERE, CAPSULE, CYLINDER, BOX = 0, 2, 3, 5, 6
 
 
 @numba.njit(cache=True)
-def draw_primitives(entity, kind, size, pos, mat, K, T_cam_world, nearest, inverse_depth, owner):  # type: ignore[no-untyped-def]  # fmt: skip
+def draw_primitives(entity, kind, size, pos, mat, K, T_cam_world, nearest, inverse_depth, owner) -> None:  # type: ignore[no-untyped-def]  # fmt: skip
     """Draw the first entry of every pixel's ray into each primitive; parameters as in ``_Primitives``."""
     height, width = inverse_depth.shape
     origin, center = np.empty(3), np.zeros(3)
@@ -39,7 +39,7 @@ def draw_primitives(entity, kind, size, pos, mat, K, T_cam_world, nearest, inver
 
 
 @numba.njit(cache=True)
-def _half_size(kind, size):  # type: ignore[no-untyped-def]
+def _half_size(kind, size) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Half size of a primitive's bounding box in its own frame."""
     half = size.copy()
     if kind == SPHERE:
@@ -52,7 +52,7 @@ def _half_size(kind, size):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _sphere_entry(o, radius, dx, dy, dz, oz):  # type: ignore[no-untyped-def]
+def _sphere_entry(o, radius, dx, dy, dz, oz) -> float:  # type: ignore[no-untyped-def]
     """First entry into a sphere at height -oz above the local origin; infinite if the ray misses it."""
     a = dx * dx + dy * dy + dz * dz
     b = o[0] * dx + o[1] * dy + oz * dz
@@ -62,7 +62,7 @@ def _sphere_entry(o, radius, dx, dy, dz, oz):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _first_entry(kind, size, o, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _first_entry(kind, size, o, dx, dy, dz) -> float:  # type: ignore[no-untyped-def]
     """Parameter at which the ray o + s d enters a primitive from outside; 0 if it does not."""
     best = math.inf
     if kind == BOX:

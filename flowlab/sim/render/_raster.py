@@ -7,7 +7,7 @@ import numpy as np
 
 
 @numba.njit(cache=True)
-def to_depth(inverse_depth):  # type: ignore[no-untyped-def]
+def to_depth(inverse_depth) -> np.ndarray:  # type: ignore[no-untyped-def]
     """z-depth [m] float32 of inverse z-depth [1/m]; 0 stays 0."""
     height, width = inverse_depth.shape
     depth = np.empty((height, width), np.float32)
@@ -18,7 +18,7 @@ def to_depth(inverse_depth):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def local_to_cam(pos, mat, T_cam_world):  # type: ignore[no-untyped-def]
+def local_to_cam(pos, mat, T_cam_world) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
     """Rotation and translation from a thing's own frame to the camera's."""
     R, t = np.empty((3, 3)), np.empty(3)
     for i in range(3):
@@ -34,7 +34,7 @@ def local_to_cam(pos, mat, T_cam_world):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def pixel_box(R, t, center, half, K, width, height):  # type: ignore[no-untyped-def]
+def pixel_box(R, t, center, half, K, width, height) -> tuple[int, int, int, int, float]:  # type: ignore[no-untyped-def]
     """Inclusive pixel bounds of a box in its own frame and its least z-depth; all pixels if it reaches behind."""
     u0, u1, v0, v1, z0 = math.inf, -math.inf, math.inf, -math.inf, math.inf
     for corner in range(8):
@@ -57,7 +57,7 @@ def pixel_box(R, t, center, half, K, width, height):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True)
-def _hidden(bounds, inverse_depth):  # type: ignore[no-untyped-def]
+def _hidden(bounds, inverse_depth) -> bool:  # type: ignore[no-untyped-def]
     """Whether everything drawn so far stands in front of the nearest point of a box."""
     u0, u1, v0, v1, z0 = bounds
     nearest = 1.0 / z0
@@ -69,7 +69,9 @@ def _hidden(bounds, inverse_depth):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")  # a vertex may lie in the camera's own plane
-def draw_meshes(vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam_world, nearest, inverse_depth, owner):  # type: ignore[no-untyped-def]  # fmt: skip
+def draw_meshes(  # type: ignore[no-untyped-def]
+    vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam_world, nearest, inverse_depth, owner
+) -> None:
     """Draw front faces into ``inverse_depth`` (H, W) and ``owner`` (H, W); parameters as in ``_Meshes``."""
     height, width = inverse_depth.shape
     if len(entity) == 0:
@@ -108,7 +110,7 @@ def draw_meshes(vertices, faces, planes, span, boxes, entity, pos, mat, K, T_cam
 
 
 @numba.njit(cache=True)
-def _clip(vertices, corners, R, t, K, nearest, clipped):  # type: ignore[no-untyped-def]
+def _clip(vertices, corners, R, t, K, nearest, clipped) -> int:  # type: ignore[no-untyped-def]
     """The part of a triangle beyond the near plane, as a polygon of up to 4 screen corners; their number."""
     near = 1.0 / nearest
     cam = np.empty((3, 3))
@@ -130,7 +132,7 @@ def _clip(vertices, corners, R, t, K, nearest, clipped):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, inline="always")
-def _draw_triangle(screen, a, b, c, who, nearest, inverse_depth, owner):  # type: ignore[no-untyped-def]
+def _draw_triangle(screen, a, b, c, who, nearest, inverse_depth, owner) -> None:  # type: ignore[no-untyped-def]
     height, width = inverse_depth.shape
     ax, bx, cx = screen[0, a], screen[0, b], screen[0, c]
     ay, by, cy = screen[1, a], screen[1, b], screen[1, c]
