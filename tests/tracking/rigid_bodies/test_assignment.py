@@ -1,7 +1,7 @@
 """Which body a pixel belongs to, against scenes in which that is known."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rigid_body_scenes import two_plates
@@ -61,6 +61,7 @@ def test_a_motion_of_no_cell_is_not_needed() -> None:
     assert select_needed(volume((0.9, 0.1, 0.5), (0.1, 0.9, 0.5), (0.8, 0.2, 0.6))) == [0, 1]
 
 
+@settings(deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(1, 6), st.just(3), st.just(4)), elements=st.floats(0, 1, width=32)))
 def test_what_is_kept_is_stillness_and_what_gains_by_more_than_the_margin(cost: np.ndarray) -> None:
     kept = select_needed(BodyAssignment(cost, cost), margin=0.1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
@@ -13,6 +13,7 @@ rng = np.random.default_rng(0)
 FEATURE = rng.integers(0, 256, (20, 30, 4), np.uint8)
 
 
+@settings(deadline=None)
 @given(u=st.floats(0, 28.9), v=st.floats(0, 18.9))
 def test_features_are_interpolated(u: float, v: float) -> None:
     (found,) = _costs.features_at(FEATURE, np.array([[u, v]], np.float32))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +16,7 @@ def assert_rotation(R: np.ndarray) -> None:
     np.testing.assert_allclose(np.linalg.det(R), 1)
 
 
+@settings(deadline=None)
 @given(rotation=vectors, t=vectors, outliers=st.integers(0, 4), seed=st.integers(0, 99))
 def test_finds_the_motion_despite_outliers(rotation: list[float], t: list[float], outliers: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -39,6 +40,7 @@ def test_agrees_with_scipy() -> None:
     np.testing.assert_allclose(t, mean_b - expected @ mean_a, atol=1e-8)
 
 
+@settings(deadline=None)
 @given(rotation=vectors, t=vectors, rank=st.sampled_from([0, 1, 2]), seed=st.integers(0, 99))
 def test_points_in_a_plane_on_a_line_or_all_the_same_get_a_rotation_that_fits(
     rotation: list[float], t: list[float], rank: int, seed: int
@@ -88,6 +90,7 @@ def test_a_motion_moves_points() -> None:
     np.testing.assert_array_equal(RigidMotion.identity(3).apply(points), np.repeat(points[None], 3, 0))
 
 
+@settings(deadline=None)
 @given(rotation=vectors, noise=st.floats(0, 0.02))
 def test_the_nearest_rotation(rotation: list[float], noise: float) -> None:
     R = Rotation.from_rotvec(rotation).as_matrix()
