@@ -119,6 +119,7 @@ def _train(data: Path, folder: Path, settings: TrainSettings, device: str) -> No
 
 
 def _finished(folder: Path) -> bool:
+    """Whether a run has come to its last step."""
     try:
         return step_of(newest_checkpoint(folder)) >= read_run_config(folder).steps
     except DataError:

@@ -22,6 +22,7 @@ def migrate_result(values: Any) -> Any:
 
 
 def _migrate_evaluation(values: Any) -> Any:
+    """The values of one checkpoint's evaluation under the names of today."""
     values = rename_keys(values, _EVALUATION)
     if isinstance(values, dict) and isinstance(values.get("outcomes"), list):
         values = {**values, "outcomes": [migrate_episode(o) for o in values["outcomes"]]}

@@ -66,4 +66,5 @@ def disambiguate(results: Sequence[PolicyResult]) -> list[PolicyResult]:
 
 
 def _labeled_tasks(result: PolicyResult) -> set[tuple[str, str]]:
+    """Every task that a result has episodes of, with the result's label."""
     return {(result.label, o.task) for e in result.evaluations for o in e.outcomes}

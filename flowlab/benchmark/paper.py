@@ -29,6 +29,7 @@ class PaperTable:
 
 
 def _row(name: str, label: str, columns: Sequence[str], *percent: float) -> PaperRow:
+    """A policy's row, of its numbers in the order of the columns; without numbers, it is ours alone."""
     return PaperRow(name, label, dict(zip(columns, percent, strict=True)) if percent else {})
 
 

@@ -62,11 +62,13 @@ def compare_with_paper(successes: Sequence[TaskSuccess], groups: Sequence[GroupS
 
 
 def _compare_row(table: PaperTable, row: PaperRow, ours: dict[tuple[str, str], Success]) -> ComparedRow:
+    """A row of the paper's with our numbers in its cells."""
     cells = tuple(_cell(row, over, ours.get((row.label, over))) for over in table.columns)
     return ComparedRow(name=row.name, label=row.label, cells=cells)
 
 
 def _cell(row: PaperRow, over: str, ours: Success | None) -> PaperCell:
+    """The paper's number and ours, whichever there is."""
     paper = round(row.percent[over] / 100, 3) if over in row.percent else None
     if ours is None:
         return PaperCell(paper=paper, ours=None)

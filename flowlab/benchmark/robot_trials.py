@@ -113,6 +113,7 @@ def _rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
 
 
 def _check_header(where: str, header: list[str]) -> list[str]:
+    """The names of the columns. Raises :class:`DataError` where one is unknown, doubled or missing."""
     for name in header:
         if name not in (*COLUMNS, NOTE):
             hint = "; separate columns by commas" if ";" in name or "\t" in name else ""
@@ -129,6 +130,7 @@ def _check_header(where: str, header: list[str]) -> list[str]:
 
 
 def _trial(where: str, columns: list[str], row: list[str]) -> RobotTrial:
+    """The trial of a row. Raises :class:`DataError` where a cell is missing or wrong."""
     if len(row) != len(columns):
         raise DataError(
             f"{where}: has {len(row)} cells, and the header {len(columns)} ({','.join(columns)}); put text that has "
@@ -159,5 +161,6 @@ def _by_policy(trials: Sequence[RobotTrial]) -> dict[str, dict[tuple[str, str], 
 
 
 def _scopes(trials: Sequence[RobotTrial]) -> list[str]:
+    """Every task, and all of them where they are several."""
     tasks = list(dict.fromkeys(x.task for x in trials))
     return [*tasks, ALL] if len(tasks) > 1 else tasks

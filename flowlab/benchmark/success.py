@@ -99,5 +99,6 @@ def group_successes(
 
 
 def _mean_steps(outcomes: Iterable[EpisodeResult]) -> float | None:
+    """Mean steps to success; None where nothing succeeded."""
     steps = [o.steps for o in outcomes if o.success]
     return round(fmean(steps), 2) if steps else None

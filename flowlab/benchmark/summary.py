@@ -96,6 +96,7 @@ def summarize(results: Sequence[PolicyResult]) -> Summary:
 
 
 def _aborted(results: Sequence[PolicyResult]) -> Iterator[AbortedEpisode]:
+    """Every episode of any checkpoint that could not go on."""
     for r in results:
         for e in r.evaluations:
             for o in by_trial(e.outcomes).values():

@@ -56,6 +56,7 @@ def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) 
 
 
 def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVariant | None = None) -> ExperimentUnit:
+    """One policy on one task, with the settings of the recipe and of its variant."""
     label = policy if variant is None else f"{policy}-{variant.name}"
     changes = [
         f"data.demonstrations={recipe.demonstrations}",

@@ -90,6 +90,7 @@ def bench(
 
 
 def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> None:
+    """Say how new results went, and how many are there."""
     for r in fresh:
         solved = sum(o.success for o in r.final)
         console.print(f"{r.name}: {solved} of {len(r.final)} solved", highlight=False)
@@ -97,10 +98,12 @@ def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> N
 
 
 def _names(text: str) -> list[str]:
+    """The names of a list with commas."""
     return [name for name in text.replace(" ", "").split(",") if name]
 
 
 def _minutes(text: str) -> float:
+    """Minutes from a time such as ``90s``. Raises :class:`UsageError` where it is none."""
     units = {"s": 1 / 60, "m": 1.0, "h": 60.0}
     try:
         minutes = float(text[:-1]) * units[text[-1]]

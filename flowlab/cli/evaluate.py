@@ -100,6 +100,7 @@ def evaluate(
 
 
 def _evaluate_offline(runs: Sequence[Path], data: Path | None, as_json: bool) -> None:
+    """Errors on held-out demonstrations, as JSON or as tables."""
     from flowlab.evaluation.offline import evaluate_offline
     from flowlab.policies.checkpoint import load_policy
     from flowlab.report.tables import demonstration_table, offline_table

@@ -91,6 +91,7 @@ def made_up_frame(workspace: Box) -> Frame:
 
 
 def _extent(xyz: Float[np.ndarray, "N 3"]) -> str:
+    """Between which coordinates points lie, in words."""
     low, high = xyz.min(0), xyz.max(0)
     return ", ".join(f"{axis} {low[a]:.2f} to {high[a]:.2f}" for a, axis in enumerate("xyz")) + " m"
 

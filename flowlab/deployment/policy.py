@@ -147,6 +147,7 @@ class Policy:
         return seconds
 
     def _observe(self, runner: PolicyRunner, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
+        """Show the runner a frame; what is wrong with it is said with the step."""
         try:
             runner.observe(frame, state)
         except DataError as error:
@@ -166,15 +167,18 @@ class Policy:
 
     @property
     def _observer_settings(self) -> ObserverSettings:
+        """How clouds are made of frames."""
         return ObserverSettings.model_validate(self.network.spec.observer or {})
 
     def _checked_state(self, state: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "S"]:
+        """See :func:`check_state`; what is wrong is said with the step."""
         try:
             return check_state(state, self.network.spec.state_width)
         except UsageError as error:
             raise UsageError(f"step {self.step}: {error}") from error
 
     def _checked_frame(self, frame: Frame | None) -> Frame:
+        """See :func:`check_frame`; what is wrong is said with the step."""
         if frame is None:
             raise UsageError(
                 f"step {self.step}: the policy looks at the frame of this step, and got None; take one whenever "
@@ -195,6 +199,7 @@ def _check_device(name: str) -> None:
 
 
 def _choose_task(known: tuple[str, ...], asked: str | None, run: Path | str) -> str:
+    """The task that is asked for, or the only one. Raises :class:`UsageError` where there is no such."""
     if asked is None and len(known) > 1:
         raise UsageError(f"{run}: was trained on several tasks; give one as task=, of {', '.join(known)}")
     if asked is not None and asked not in known:

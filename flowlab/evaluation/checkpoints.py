@@ -100,6 +100,7 @@ def common_tasks(checkpoints: Sequence[CheckpointRef], asked: Sequence[str] = ()
 
 
 def _needs_cloud(trained: TrainedPolicy) -> bool:
+    """Whether the policy is shown point clouds, or points that are chosen of them."""
     needs = trained.policy.settings.needs
     return needs.point_cloud is not None or needs.flow is not None
 

@@ -40,6 +40,7 @@ def repair_tail(path: Path) -> None:
 
 
 def _whole_lines(path: Path) -> Iterator[EpisodeResult]:
+    """The result of every line but one that a kill cut off."""
     *whole, _ = (path.read_bytes() if path.exists() else b"").split(b"\n")
     for number, line in enumerate(whole, 1):
         try:

@@ -132,12 +132,14 @@ def run_batch(batch: EpisodeBatch) -> int:
 
 
 def _checkpoints_of(path: Path, n_action_steps: int | None, *, every: bool) -> list[CheckpointRef]:
+    """All checkpoints of a run, or the newest alone."""
     return find_checkpoints(path, n_action_steps) if every else [find_checkpoint(path, n_action_steps)]
 
 
 def _run_batches(
     batches: Sequence[EpisodeBatch], total: int, start_engine: StartEngine[EpisodeBatch, int], on_progress: Progress
 ) -> None:
+    """Have workers try every batch. Raises :class:`UnfinishedError` where some failed."""
     done = total - sum(len(b.trials) for b in batches)
     on_progress(done, total)
     failures = []
@@ -182,9 +184,11 @@ def _missing_batches(
 
 @lru_cache(maxsize=4)
 def _policy(weights: Path, device: str) -> PolicyNetwork:
+    """A policy that this worker keeps for its next batch."""
     return load_policy(weights, device).policy
 
 
 @lru_cache(maxsize=1)
 def _simulators(task: str, scene: SceneSettings) -> SimulatorPool:
+    """Simulators that this worker keeps for its next batch."""
     return SimulatorPool(task, scene)

@@ -75,6 +75,7 @@ class PointStepErrors:
         )
 
     def _error_of(self, distance: Float[np.ndarray, "D P"], camera: Camera | None) -> FlowError:
+        """The figures of some predictions, averaged over them."""
         apd = average_jaccard = None
         if camera is not None and self.visible.any():
             _, z = camera.project(self.xyz_world.T.astype(np.float64))
@@ -115,6 +116,8 @@ def pool_errors(each: Sequence[FlowErrors]) -> FlowErrors | None:
 
 
 def _pool(each: Sequence[FlowError], pairs: Sequence[int], ends: Sequence[int], seen: Sequence[int]) -> FlowError:
+    """The mean of some errors, each as heavy as the pairs, ends or seen pairs it is of."""
+
     def mean(name: str, weights: Sequence[int]) -> float | None:
         known = [(getattr(e, name), w) for e, w in zip(each, weights, strict=True) if getattr(e, name) is not None]
         return float(np.average([v for v, _ in known], weights=[w for _, w in known])) if known else None

@@ -118,9 +118,11 @@ class _OfflineEvaluator:
         return OfflineErrors(**validate(self._policy, self._builder, self._windows(demos), device))
 
     def _windows(self, demos: Sequence[int]) -> WindowIndex:
+        """The windows of some demonstrations, one for each plan that is asked for."""
         return index_windows(self._held_out.buffer, list(demos), self._policy.spec.settings.n_action_steps)
 
     def _flow(self, demo: int) -> FlowErrors | None:
+        """Errors of predicted flow; None where none is predicted, or nothing moves."""
         if self._sampler is None:
             return None
         errors = self._sampler.compare(self._windows([demo]))

@@ -45,6 +45,7 @@ def describe_run(run: Path, evaluations: Sequence[CheckpointEvaluation]) -> Poli
 
 
 def _count_weights(checkpoint: Path) -> int:
+    """How many numbers a checkpoint holds."""
     with safe_open(checkpoint, "pt") as file:
         return sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - no mapping
 

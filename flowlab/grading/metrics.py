@@ -135,7 +135,7 @@ def _summary(error_m: Float[np.ndarray, "K"]) -> TrackErrors | None:
     known = error[np.isfinite(error)]
     median, p95, mean = (np.median(known), np.percentile(known, 95), known.mean()) if len(known) else [np.nan] * 3
 
-    def within(limit_mm: float) -> float:
+    def within(limit_mm: float | int) -> float:
         return float((error < limit_mm).mean())  # what is not a number is within nothing
 
     return TrackErrors(

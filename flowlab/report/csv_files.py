@@ -43,6 +43,7 @@ def episode_rows(results: Sequence[PolicyResult]) -> Rows:
 
 
 def _episode(o: EpisodeResult) -> tuple[object, ...]:
+    """The columns of one episode, from its task on."""
     flow = [None if o.flow is None else getattr(o.flow, name) for name in _FLOW_COLUMNS]
     tried = (o.task, o.seed, o.episode, o.scene_seed)
     return (*tried, int(o.success), int(o.success_dp3), o.steps, o.note, *flow)

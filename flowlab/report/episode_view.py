@@ -83,6 +83,7 @@ def is_run(source: Path) -> bool:
 
 
 def _view_stored(data: Dataset, episode: int, task: str | None, rejects: bool) -> EpisodeView:
+    """An episode of a dataset, or of what was kept out of it."""
     about = f"dataset {data.path}, fingerprint {data.fingerprint}, recipe {data.manifest.recipe}"
     if not rejects:
         shown = data.episode(_position(data, data.refs, "episode", episode, task))
@@ -94,6 +95,7 @@ def _view_stored(data: Dataset, episode: int, task: str | None, rejects: bool) -
 
 
 def _view_attempt(run: Path, task: str | None, seed: int, episode: int) -> EpisodeView:
+    """An episode that the policy of a run tries now."""
     from flowlab.evaluation.checkpoints import common_tasks, find_checkpoint
     from flowlab.evaluation.replay import replay_episode
     from flowlab.evaluation.trials import check_unseen, list_trials
@@ -121,6 +123,7 @@ def _position(data: Dataset, refs: Sequence[EpisodeRef | RejectRef], kind: str, 
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
+    """Turns a failure to write a file into a sentence."""
     try:
         yield
     except OSError as error:

@@ -51,6 +51,7 @@ def success_panels(summary: Summary) -> list[SuccessPanel]:
 
 
 def _mark(share: Proportion, label: str, over: str) -> Mark:
+    """What is drawn of a share, with the paper's number if it has one."""
     return Mark(share.share, share.low, share.high, paper_share(label, over))
 
 

@@ -83,15 +83,18 @@ def held_out_errors(summary: Summary) -> dict[str, list[tuple[str, float, float 
 
 
 def _machine(training: TrainingRecord) -> str:
+    """A processor, and the libraries used on it."""
     versions = ", ".join(f"{name} {version}" for name, version in sorted(training.versions.items()))
     return f"{training.processor}: {versions}"
 
 
 def _percent(share: float, digits: int = 1) -> str:
+    """A share from 0 to 1 as a percentage."""
     return f"{100 * share:.{digits}f}"
 
 
 def _p_value(p: float) -> str:
+    """A p-value with as many digits as say something."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -101,4 +104,5 @@ def _number(value: float | None, digits: int = 1) -> str:
 
 
 def _short(value: float) -> str:
+    """A number with three digits."""
     return f"{value:.3g}"

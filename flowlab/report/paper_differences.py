@@ -27,6 +27,7 @@ def paper_differences(summary: Summary) -> list[str]:
 
 
 def _budget(summary: Summary) -> str:
+    """How long policies were trained, and on what."""
     trained = [f.training for f in summary.training]
     minutes = _span([t.cpu_s / 60 for t in trained], ".1f")
     steps = _span([t.steps for t in trained], ",d")
@@ -38,6 +39,7 @@ def _budget(summary: Summary) -> str:
 
 
 def _demonstrations(summary: Summary) -> str:
+    """How many demonstrations they were trained on."""
     counts = [f.training.demonstrations / max(len(f.tasks), 1) for f in summary.training]
     if set(counts) == {DEMONSTRATIONS}:
         return f"Both learned from {DEMONSTRATIONS} demonstrations of each task, by scripted experts."
@@ -45,6 +47,7 @@ def _demonstrations(summary: Summary) -> str:
 
 
 def _episodes(summary: Summary) -> str:
+    """How many episodes they were tried on, and which."""
     counts = [s.success.n for s in summary.successes]
     if not counts:
         return "No episodes were tried."
@@ -86,6 +89,7 @@ def _network(summary: Summary) -> Iterable[str]:
 
 
 def _policies(summary: Summary) -> Iterable[str]:
+    """Of which policies the paper has something else, or nothing."""
     labels = set(summary.labels)
     if any(x.partition("-")[0] == MBA for x in labels):
         yield "Our MBA is, like the paper's, 3D FDP with a head that predicts the object's pose in place of the flow."
@@ -102,5 +106,6 @@ def _setting(settings: Mapping[str, Any], path: str) -> Any:
 
 
 def _span(values: Sequence[float], form: str) -> str:
+    """Least and greatest of some numbers, or the only one."""
     low, high = format(min(values), form), format(max(values), form)
     return low if low == high else f"{low} to {high}"

@@ -120,17 +120,21 @@ def demonstration_table(report: OfflineReport, title: str = "") -> Table:
 
 
 def _success_row(name: str, x: TaskSuccess | GroupSuccess) -> tuple[object, ...]:
+    """The row of a policy on a task or group of that name."""
     counts = x.success.successes, x.success.n, _percent(x.success), _interval(x.success)
     return name, x.label, *counts, _percent(x.success_dp3), x.mean_steps or "-"
 
 
 def _percent(share: Proportion) -> float:
+    """A share as a percentage with one digit."""
     return round(100 * share.share, 1)
 
 
 def _interval(share: Proportion) -> str:
+    """The limits of a share, as percentages."""
     return f"{100 * share.low:.0f} - {100 * share.high:.0f}"
 
 
 def _dashed(row: Sequence[object]) -> tuple[object, ...]:
+    """A row with dashes where there is nothing."""
     return tuple("-" if value is None else value for value in row)

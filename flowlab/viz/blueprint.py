@@ -49,6 +49,7 @@ def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Bluepri
 
 
 def _plot(name: str, contents: list[str], *, legend: bool, axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+    """A view of lines over time."""
     box = rrb.PlotLegend(rrb.Corner2D.RightBottom, visible=legend)
     return rrb.TimeSeriesView(origin="/scalars", contents=contents, name=name, plot_legend=box, axis_y=axis_y)
 

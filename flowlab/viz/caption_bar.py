@@ -105,6 +105,7 @@ class CaptionBar:
             x -= 16
 
     def _dot(self, x: float, marker: str, face: ColorType, edge: ColorType) -> None:
+        """A round mark in the legend."""
         points = self._scale * 72 / _DPI
         mark = Line2D(
             [x / self._width], [1 - 69 / self._height], marker=marker, markersize=8 * points, markerfacecolor=face,
@@ -122,6 +123,7 @@ class CaptionBar:
         self._figure.add_artist(line)
 
     def _draw_progress(self, width: int) -> UInt8[np.ndarray, "h W 3"]:
+        """The line of progress at the end of the video, in color."""
         quality, count = self._episode.tracks.quality, self._episode.queries.count
         step = np.arange(width) * len(self._episode) // width
         rgb = np.full((width, 3), 170, np.uint8)

@@ -28,6 +28,7 @@ def caption(episode: Episode, shown: int) -> str:
 
 
 def _ending(episode: Episode) -> str:
+    """When an episode was solved; of a recording, how sure its tracks are."""
     if episode.tracks.quality is not None:  # of a recording, which nobody needs to tell whether it succeeded
         return sigma_summary(episode)
     return f"solved at step {int(episode.success.argmax())}" if episode.success.any() else "not solved"

@@ -90,6 +90,7 @@ def _drawn_paths(episode: Episode, plan: PlanPrediction) -> Int[np.ndarray, "N"]
 
 
 def _caption(episode: Episode, plan: PlanPrediction, shown: int) -> str:
+    """A plan in one line: its errors, and how much of it is shown."""
     moves, n_action_steps = int(plan.moving.sum()), len(plan.true_world) - 1
     error = f"ADE {1000 * plan.error.mean():.1f} mm, FDE {1000 * plan.error[-1].mean():.1f} mm" if moves else ""
     parts = [
@@ -138,6 +139,7 @@ def _draw_scene(
 
 
 def _draw_legend(figure: Figure, episode: Episode) -> None:
+    """What marks and lines mean."""
     true = Line2D([], [], color=INK, linewidth=0.9, marker="o", markersize=3.5, markevery=[1], label="true path")
     marks = [dot("start", "white", QUIET), dot("predicted end", TIME_COLORS(1.0), "none")]
     draw_legend(figure, [*role_dots(episode), *marks, true], length=1.4)

@@ -58,6 +58,7 @@ def plot_grades(metrics: Mapping[str, TrackMetrics], title: str, about: str = ""
 
 
 def _draw_curves(axes: Axes, group: str, metrics: Mapping[str, TrackMetrics], colors: Mapping[str, str]) -> None:
+    """The cumulative errors of every tracker in one group of points."""
     for name, of_tracker in metrics.items():
         errors = getattr(of_tracker, group)
         if errors is not None:
@@ -88,6 +89,7 @@ def _draw_reliability(axes: Axes, calibrations: Mapping[str, Calibration], color
 
 
 def _style_panel(axes: Axes, heading: str, ticks_mm: tuple[int, ...]) -> None:
+    """A panel's grid, heading and ticks on an axis of millimeters."""
     limits = axes.get_xlim()
     axes.set_xticks(ticks_mm, [str(t) for t in ticks_mm])
     axes.set_xlim(limits)

@@ -54,6 +54,7 @@ def plot_learning_curves(curves: Mapping[str, Mapping[str, LearningCurve]], labe
 
 
 def _draw_curve(axes: Axes, curve: LearningCurve, color: str) -> None:
+    """One policy's success at its checkpoints, with a band for the interval."""
     low, high = ([getattr(m, name) for m in curve.marks] for name in ("low", "high"))
     axes.fill_between(curve.minutes, low, high, color=color, alpha=0.13, linewidth=0, zorder=2)
     axes.plot(

@@ -99,18 +99,21 @@ class Overlay:
             cv2.addWeighted(layer, alpha, canvas, 1 - alpha, 0, dst=canvas)
 
     def _draw_disc(self, canvas: UInt8[np.ndarray, "H W 3"], t: int, k: int) -> None:
+        """The mark of point k in sight."""
         import cv2
 
         for radius, rgb in ((4.9, _RIM), (3.8, self._ink(t, k))):
             cv2.circle(canvas, self._at(t, k), self._sub(radius), rgb, -1, cv2.LINE_AA, _SUBPIXEL)
 
     def _draw_ring(self, canvas: UInt8[np.ndarray, "H W 3"], t: int, k: int) -> None:
+        """The mark of point k out of sight."""
         import cv2
 
         for radius, rgb in ((6.0, _RIM), (5.2, self._ink(t, k, _HIDDEN_LIGHT))):
             cv2.circle(canvas, self._at(t, k), self._sub(radius), rgb, self._px(1.6), cv2.LINE_AA, _SUBPIXEL)
 
     def _draw_cross(self, canvas: UInt8[np.ndarray, "H W 3"], t: int, k: int) -> None:
+        """The mark of point k whose position was filled in."""
         import cv2
 
         (u, v), arm = self._at(t, k), self._sub(3.2)
@@ -119,9 +122,11 @@ class Overlay:
             cv2.polylines(canvas, strokes, False, rgb, self._px(width), cv2.LINE_AA, _SUBPIXEL)
 
     def _at(self, t: int, k: int) -> tuple[int, int]:
+        """Where point k is on the canvas at step t, in OpenCV's fixed point."""
         return int(self._uv[t, k, 0]), int(self._uv[t, k, 1])
 
     def _ink(self, t: int, k: int, light: float = 1.0) -> tuple[int, ...]:
+        """The color of point k at step t, darkened to a share ``light``."""
         return tuple(int(light * channel) for channel in self._rgb[t, k])
 
     def _px(self, length: float) -> int:

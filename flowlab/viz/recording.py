@@ -83,10 +83,12 @@ def _times(episode: Episode, steps: Sequence[int] | None = None) -> list[rr.Time
 
 
 def _send_info(recording: rr.RecordingStream, text: str) -> None:
+    """The info panel."""
     recording.log("/info", rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
+    """The cloud of every step."""
     steps = range(len(episode))
     points = [episode.point_cloud[t, : episode.point_count[t]] for t in steps]
     colors = [cloud_rgb_at(episode, t) for t in steps]
@@ -96,6 +98,7 @@ def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
+    """The query points of every step, and their trails."""
     T, M = len(episode), episode.queries.count
     xyz_world = episode.tracks.xyz_world[:, :M]
     rgb = _shaded(track_rgb(episode), episode.tracks.visible[:, :M])
@@ -131,6 +134,7 @@ def _send_predictions(recording: rr.RecordingStream, episode: Episode, plans: Se
 
 
 def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
+    """The camera, and which way is up."""
     camera, T_world_cam = episode.camera, episode.camera.T_world_cam
     axes = rr.ViewCoordinates.RDF if world_is_camera_frame(camera) else rr.ViewCoordinates.RIGHT_HAND_Z_UP
     recording.log("/", axes, static=True)
@@ -145,6 +149,7 @@ def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _send_pictures(recording: rr.RecordingStream, episode: Episode) -> None:
+    """Depth and color of every step, whichever there are."""
     T, resolution = len(episode), {"width": episode.camera.width, "height": episode.camera.height}
     if episode.depth is not None:
         depth_mm = np.clip(episode.depth * 1000 + 0.5, 0, 65535).astype(np.uint16)  # half the size of float32
@@ -162,6 +167,7 @@ def _send_pictures(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
+    """The object's pose at every step, if it is known."""
     if episode.object_pose is None:
         return
     R_world_object = rotation_from_6d(episode.object_pose[:, 3:])
@@ -171,6 +177,7 @@ def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
+    """Lines of state, action, success, and of the quality of tracks."""
     for group, table in (("state", episode.state), ("action", episode.action)):
         for k, column in enumerate(table.T):
             color = SERIES_RGB[k % len(SERIES_RGB)]
@@ -189,6 +196,7 @@ def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
 
 
 def _send_flow_error(recording: rr.RecordingStream, episode: Episode, errors: Sequence[tuple[int, float]]) -> None:
+    """The line of flow errors."""
     steps, error = zip(*errors, strict=True)
     values, name = 1000 * np.array(error), "flow error [mm]"
     _send_line(recording, episode, "flow_error", values, name=name, color=PREDICTED_RGB, steps=steps)

@@ -60,6 +60,7 @@ def _drawn_trails(episode: Episode) -> Int[np.ndarray, "K"]:
 
 
 def _draw_camera_view(axes: Axes, episode: Episode) -> None:
+    """The first cloud and the tracks as the camera sees them."""
     cloud = episode.point_cloud[0, : episode.point_count[0]]
     depth = episode.camera.project(cloud)[1]
     tracks = project_upright(episode.camera, episode.tracks.xyz_world[:, : episode.queries.count])
@@ -70,6 +71,7 @@ def _draw_camera_view(axes: Axes, episode: Episode) -> None:
 
 
 def _draw_side_view(axes: Axes, episode: Episode) -> None:
+    """The same from the side that shows most of the motion."""
     cloud = episode.point_cloud[0, : episode.point_count[0]]
     tracks = episode.tracks.xyz_world[:, : episode.queries.count]
     moves = moving(episode)
@@ -108,6 +110,7 @@ def _ink(episode: Episode) -> Float[np.ndarray, "M 3"]:
 
 
 def _draw_legend(figure: Figure, episode: Episode) -> None:
+    """What marks and colors mean."""
     dots = role_dots(episode)
     if episode.tracks.quality is not None:
         sigmas = np.array([0, 0.5, 1]) * SIGMA_LIMIT

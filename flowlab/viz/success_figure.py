@@ -90,14 +90,17 @@ def _split(panels: Sequence[SuccessPanel]) -> list[Sequence[SuccessPanel]]:
 
 
 def _rows(panel: SuccessPanel) -> dict[str, Mapping[str, Mark]]:
+    """A panel's tasks, and below them their mean."""
     return {**panel.rows, **({_MEAN: panel.mean} if panel.mean else {})}
 
 
 def _panel_height(panel: SuccessPanel) -> float:
+    """Of a panel with heading and axis [in]."""
     return sum(row_height(marks, _PITCH_IN) for marks in _rows(panel).values()) + HEADING_IN + AXIS_IN
 
 
 def _draw_panel(axes: Axes, panel: SuccessPanel, colors: Mapping[str, str]) -> None:
+    """The tasks of a group, policy by policy."""
     rows = _rows(panel)
     style_axes(axes, panel.heading)
     places = lay_out_rows(axes, rows, _PITCH_IN)
@@ -110,6 +113,7 @@ def _draw_panel(axes: Axes, panel: SuccessPanel, colors: Mapping[str, str]) -> N
 
 
 def _draw_mark(axes: Axes, mark: Mark, y: float, color: str) -> None:
+    """A dot, its interval, and a diamond for the paper's number."""
     axes.plot([mark.low, mark.high], [y, y], color=color, linewidth=1.3, alpha=0.6, zorder=3, solid_capstyle="butt")
     axes.plot([mark.share], [y], color=color, marker="o", markersize=4.2, linestyle="", zorder=5, clip_on=False)
     if mark.paper is not None:

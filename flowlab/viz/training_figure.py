@@ -131,6 +131,7 @@ def _make_axes(figure: Figure, column: int, columns: int, heights: Sequence[floa
 
 
 def _draw_losses(axes: Axes, training: Sequence[MetricsLine]) -> None:
+    """The losses of training, on a logarithmic axis."""
     known = [name for name in LOSSES if any(name in line.values for line in training)]
     if "motion_loss" not in known:
         known = known[:1]  # the loss is the action's
@@ -148,6 +149,7 @@ def _draw_losses(axes: Axes, training: Sequence[MetricsLine]) -> None:
 
 
 def _draw_rate(axes: Axes, training: Sequence[MetricsLine]) -> None:
+    """The learning rate."""
     steps, values = series(training, "lr")
     _plot(axes, steps, values, QUIET)
     highest = float(values.max(initial=0))

@@ -36,6 +36,7 @@ def read_metrics(path: Path) -> list[MetricsLine]:
 
 
 def _parse(path: Path, number: int, text: bytes) -> MetricsLine:
+    """One line. Raises :class:`DataError` where it is damaged."""
     try:
         values = json.loads(text)
         kind, step = str(values.pop("kind")), int(values.pop("step"))

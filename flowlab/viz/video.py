@@ -109,6 +109,7 @@ def _frame(pictures: VideoFrames, overlay: Overlay, bar: CaptionBar, t: int) -> 
 
 
 def _encode(path: Path, rate: Fraction, frames: Iterator[UInt8[np.ndarray, "h w 3"]]) -> None:
+    """Write frames as H.264 in colors that browsers show right."""
     import av
 
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:

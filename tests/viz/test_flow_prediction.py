@@ -143,7 +143,7 @@ def test_info_says_what_the_lines_are(
 ) -> None:
     text = found["/info", "TextDocument:text"][0][0]
     assert text.startswith("By hand.\n\n|")
-    for fact in ("yellow lines", "expected", "2 mm", "5 mm", "flow error"):
+    for fact in ("yellow lines", "predicted", "2 mm", "5 mm", "flow error"):
         assert fact in text
     plain = recorded(episode, None, tmp_path)
     assert not any("predicted" in entity for entity, _ in plain)
