@@ -269,7 +269,7 @@ def _unreleased(text: str) -> str:
 def _is_name(line: str, word: re.Match[str]) -> bool:
     """Whether a word is quoted: the name of an old setting, or a word that is misspelled on purpose."""
     before, after = line[: word.start()], line[word.end() :]
-    return before[-1:] in set("\"'`.") and after[:1] in set("\"'`.=")
+    return before[-1:] in set("\"'`.") and after[:1] in set("\"'`.=:")
 
 
 def _callables(name: str, node: ast.AST) -> Iterator[tuple[str, ast.FunctionDef]]:
