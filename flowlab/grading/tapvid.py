@@ -62,6 +62,6 @@ def _focal_px(camera: Camera, settings: MetricSettings) -> float:
     return float(np.sqrt(fx * fy) * 256 / min(camera.width, camera.height))
 
 
-def _share(part: int, whole: int) -> float:
+def _share(part: int | np.integer, whole: int | np.integer) -> float:
     """A share; not a number of nothing."""
     return float(part / whole) if whole else float("nan")

@@ -99,7 +99,7 @@ class PolicyNetwork(nn.Module, ABC):
         if missing := settings.needs.missing_from(buffer):
             raise DataError(
                 f"{path}: has no {missing}, which {settings.policy} is trained on; make the dataset with them, or "
-                "train another policy: dp3 needs point clouds only"
+                "train --policy dp3, which needs point clouds only"
             )
 
     def forward(self, batch: Batch, noise: NoiseSampler, windows: int) -> Losses:

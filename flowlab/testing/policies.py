@@ -23,7 +23,7 @@ from flowlab.data.needs import Needs
 from flowlab.data.settings import TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Losses, PolicyNetwork, PolicySpec
-from flowlab.testing.policy_problem import ACTION, Problem, make_problem
+from flowlab.testing.policy_problem import ACTION, PICTURE, Problem, make_problem
 
 STEPS = 60
 """Training steps within which the loss must fall."""
@@ -156,7 +156,8 @@ def check_needs(policy: Policy, settings: Sequence[str] = ()) -> None:
         "flow": (needs.flow is None, torch.full((windows, horizon, 3, 3), torch.nan)),
         "flow_weight": (needs.flow is None, torch.full((windows, horizon, 3), torch.nan)),
         "object_pose": (not needs.object_pose, torch.full((windows, horizon, 9), torch.nan)),
-        "depth": (not needs.depth, torch.full((frames, 4, 4), torch.nan)),
+        "depth": (not needs.depth, torch.full((frames, PICTURE, PICTURE), torch.nan)),
+        "rgb": (not needs.rgb, torch.full((frames, PICTURE, PICTURE, 3), 255, dtype=torch.uint8)),
     }
     other = replace(batch, **{name: value for name, (unneeded, value) in nothing.items() if unneeded})
     mine, theirs = (problem.policy.plan(_context(b), _generator(0)).action for b in (batch, other))

@@ -76,7 +76,7 @@ def test_it_is_evaluated_in_simulation(run: Path) -> None:
     assert done.returncode == 0, done.stderr
     (log,) = run.rglob("episodes.jsonl")
     tried = [json.loads(line) for line in log.read_text().splitlines()]
-    assert [(t["task"], t["note"]) for t in tried] == [("drawer-open", "")] * 2
+    assert [(t["task"], t.get("note", "")) for t in tried] == [("drawer-open", "")] * 2
 
 
 def test_it_drives_a_robot_by_color(run: Path, data: Path, policy: type[PolicyNetwork]) -> None:
