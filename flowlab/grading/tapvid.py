@@ -49,9 +49,9 @@ def tapvid(
     for pixels in PIXELS:
         within = error < pixels * pixel_m
         hits, false = (within & visible & stated).sum(), (stated & ~(visible & within)).sum()
-        apd.append(_share((within & visible).sum(), visible.sum()))
-        jaccard.append(_share(hits, visible.sum() + false))
-    return TapVid3D(float(np.mean(jaccard)), float(np.mean(apd)), _share((stated == visible).sum(), visible.size))
+        apd.append(_share(int((within & visible).sum()), int(visible.sum())))
+        jaccard.append(_share(int(hits), int(visible.sum() + false)))
+    return TapVid3D(float(np.mean(jaccard)), float(np.mean(apd)), _share(int((stated == visible).sum()), visible.size))
 
 
 def _focal_px(camera: Camera, settings: MetricSettings) -> float:
