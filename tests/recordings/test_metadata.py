@@ -100,7 +100,7 @@ def test_the_settings_and_readers_of_the_page_exist() -> None:
 
 
 def test_the_recording_of_the_page_is_written_and_read(tmp_path: Path) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    block = next(b for b in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "write_rgbd_recording" in b)
     exec(block, {"folder": tmp_path / "r"})
     assert write_rgbd_recording.__name__ in block
     about = describe(tmp_path / "r", RecordingSettings())

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
+from flowlab.config import SettingsError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Clip, Tracks2D
 from flowlab.testing.trackers import FRAMES, rolling
@@ -103,7 +103,7 @@ def test_one_frame_is_only_what_was_asked() -> None:
 
 
 def test_chunks_that_leave_a_gap_are_refused() -> None:
-    with pytest.raises(ValidationError, match=r"stride \(8\) must be below length \(8\): chunks have to overlap"):
+    with pytest.raises(SettingsError, match=r"stride \(8\) must be below length \(8\): chunks have to overlap"):
         ChunkSettings(length=8, stride=8)
 
 
