@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from flowlab.config import SettingsError
 from flowlab.errors import MissingLibraryError
 from flowlab.geometry.camera import Camera
 from flowlab.perception.cleaning import OutlierSettings, TableSettings, outlier_mask, table_mask
@@ -119,7 +119,7 @@ def test_options_are_switched_on_and_off_in_words() -> None:
     assert ObserverSettings(remove_table=True).remove_table == TableSettings()  # type: ignore[arg-type]
     assert ObserverSettings(remove_table=False, remove_outliers=None) == ObserverSettings()  # type: ignore[arg-type]
     assert ObserverSettings(remove_outliers={"neighbors": 5}).remove_outliers == OutlierSettings(neighbors=5)  # type: ignore[arg-type]
-    with pytest.raises(ValidationError, match="remove_table"):
+    with pytest.raises(SettingsError, match="remove_table"):
         ObserverSettings(remove_table="yes")  # type: ignore[arg-type]
 
 
