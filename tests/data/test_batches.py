@@ -15,9 +15,9 @@ from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.needs import CloudNeeds, FlowNeeds, Needs
-from flowlab.data.query_points import choose_queries
+from flowlab.data.query_subset import choose_queries
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.settings import BatchSettings, TrainSettings
+from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.data.window_sampler import WindowIndex, WindowSampler, index_windows
 from flowlab.errors import DataError, UsageError
 from flowlab.policies.fdp import FDPSettings

@@ -17,8 +17,7 @@ from flowlab.errors import UsageError
 from flowlab.pipeline.filling import run_all
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler, SeedScheduler, next_units, unit_size
 from flowlab.pipeline.units import JobShard, WorkUnit
-from flowlab.storage.dataset import keep_receipt
-from flowlab.storage.manifest import Receipt, Reject, read_receipts
+from flowlab.storage.receipts import Receipt, Reject, keep_receipt, read_receipts
 from flowlab.storage.recorded import Recorded
 
 TASKS = ("push", "roll")

@@ -12,8 +12,8 @@ from rigid_body_scenes import FRAMES, Scene, scene, still_camera_moves, two_plat
 from scipy.spatial.transform import Rotation
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _gauss_newton
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody, track_poses
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def align(scene: Scene, k: int, t: int, R: np.ndarray, s: np.ndarray, iterations: int = 10) -> tuple[np.ndarray, ...]:

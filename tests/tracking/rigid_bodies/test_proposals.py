@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
 
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.proposals import MIN_SEEDS, Trajectories, propose_motions, track_seeds
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def motion(seed: int, frames: int = 20, still: bool = False) -> RigidMotion:
