@@ -10,6 +10,7 @@ import torch
 from builders import HAND, every_window, random_buffer, tiny_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.batches import Batch, ObservationBatch
@@ -70,7 +71,7 @@ def numbered(count: int) -> WindowIndex:
     return WindowIndex(np.arange(count) // 10, np.arange(count), np.zeros(count, int))
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=examples(80), deadline=None, derandomize=True)
 @given(
     count=st.integers(1, 60),
     segment=st.integers(1, 9),
