@@ -16,7 +16,7 @@ test: .venv/test ## the tests, below 8 minutes on 2 cores
 	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
 
 test-all: .venv/test ## the tests, and the slow ones: all 50 tasks, other tools' readers
-	$(BIN)/pytest -n 2 --dist loadfile
+	FLOWLAB_TESTS=all $(BIN)/pytest -n 2 --dist loadfile
 
 lint: .venv/lint ## format, style, types, import contracts, spelling
 	$(BIN)/ruff format --check

@@ -44,7 +44,7 @@ from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import LoadedPolicy, load_policy
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
 from flowlab.sim.simulation import SceneSettings, Simulation
 from flowlab.training.run import ComputeSettings, prepare_run, run

@@ -25,7 +25,7 @@ from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import list_trials
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.sim.simulation import SceneSettings
 from flowlab.training.distributed import has_bf16
 from flowlab.training.run import ComputeSettings, prepare_run, run

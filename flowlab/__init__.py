@@ -7,7 +7,7 @@ from flowlab.version import __version__
 
 if TYPE_CHECKING:
     from flowlab import data
-    from flowlab.deployment.policy import Policy
+    from flowlab.deployment.robot_policy import Policy
     from flowlab.errors import (
         DataError,
         FlowlabError,
@@ -52,7 +52,7 @@ _LAZY = {
     "evaluate": "flowlab.evaluation.evaluate",
     "grade": "flowlab.grading.run",
     "PolicyResult": "flowlab.evaluation.results",
-    "Policy": "flowlab.deployment.policy",
+    "Policy": "flowlab.deployment.robot_policy",
     "Camera": "flowlab.geometry.camera",
     **dict.fromkeys(
         (

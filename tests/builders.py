@@ -13,11 +13,11 @@ from flowlab.data.batches import Batch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.normalizer import Normalizer, Scale
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.data.window_sampler import WindowIndex, index_windows
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicySpec
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.records import Episode, Role
 
 MLP = "{kind: mlp, widths: [16, 16], step_embedding: 8}"

@@ -6,10 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+from thoroughness import examples
 
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.stage import EpisodeRequest
 from flowlab.records import Episode
+
+settings.register_profile("flowlab", max_examples=examples(100), deadline=None)
+settings.load_profile("flowlab")
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -9,8 +9,8 @@ import numpy as np
 from flowlab.geometry.sampling import farthest_points
 from flowlab.records import Clip
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 FRAMES = 16
 

@@ -13,8 +13,9 @@ from flowlab.geometry.camera import Camera
 from flowlab.provenance import Provenance
 from flowlab.records import Entity, Episode, PositionSource, Quality, Queries, Role, Tracks3D
 from flowlab.storage import stats
-from flowlab.storage.dataset import Dataset, begin, keep_receipt, summarize
-from flowlab.storage.manifest import Manifest, Receipt
+from flowlab.storage.dataset import Dataset, begin, summarize
+from flowlab.storage.manifest import Manifest
+from flowlab.storage.receipts import Receipt, keep_receipt
 from flowlab.storage.shard import episode_digest, write_shard
 
 ENTITIES = (Entity("plate", "plate", Role.PROP), Entity("ball", "ball", Role.OBJECT))

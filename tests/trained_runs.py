@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 from synthetic import call_cli, make_dataset, make_episode, with_quality
 
 from flowlab.cli import main
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.records import Episode, Queries
 
 NETWORK = Path(__file__).parent / "profiles/network.yaml"

@@ -25,7 +25,7 @@ from flowlab.config import Settings
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import Needs
 from flowlab.data.normalizer import Scaler
-from flowlab.data.settings import BatchSettings, TrainSettings
+from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
 

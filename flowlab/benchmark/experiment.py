@@ -9,7 +9,7 @@ from typing import Any
 from flowlab.benchmark.recipe import ExperimentRecipe, curve_trials, final_trials
 from flowlab.benchmark.results import read_result, unit_path, write_result
 from flowlab.benchmark.units import ExperimentUnit, plan_units, sampling_of
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.engines.base import StartEngine, engine_by_name
 from flowlab.errors import DataError, UnfinishedError
 from flowlab.evaluation.checkpoints import find_checkpoints

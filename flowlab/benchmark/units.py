@@ -4,10 +4,10 @@ from collections import Counter
 
 from flowlab.benchmark.recipe import ExperimentRecipe, PolicyVariant, expand_tasks, final_trials
 from flowlab.config import Settings
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.engines.base import core_count
 from flowlab.errors import UsageError, unknown_name
-from flowlab.policies.settings import AnyTrainSettings, load_settings
+from flowlab.policies.profiles import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
 
 DATA = "data"

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float32, Int
 from flowlab.data.augmentation import SceneAugmentation
 from flowlab.data.batches import Batch
 from flowlab.data.channels import ChannelSpec
-from flowlab.data.query_points import choose_queries, label_weight
+from flowlab.data.query_subset import choose_queries, label_weight
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.data.window_sampler import WindowIndex
 from flowlab.errors import UsageError
 

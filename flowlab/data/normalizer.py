@@ -12,8 +12,8 @@ from flowlab.config import Settings
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.needs import FlowNeeds
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource
+from flowlab.data.training_settings import TrainSettings
 
 _STILL = 1e-4
 """A channel that varies less than this is only centered, as in DP3."""

@@ -62,7 +62,7 @@ class ReplayBuffer:
 
     def split(self, demonstrations: int | None, held_out: int) -> tuple[list[int], list[int]]:
         """Which episodes to train on, and which to validate on; see
-        :class:`~flowlab.data.settings.DataSettings`."""
+        :class:`~flowlab.data.training_settings.DataSettings`."""
         train, held = [], []
         for task in self.tasks:
             of_task = [k for k, e in enumerate(self.episodes) if e.task == task]

@@ -10,8 +10,8 @@ from flowlab.evaluation.results import RolloutFlowError
 from flowlab.geometry.camera import Camera
 from flowlab.grading.tapvid import tapvid
 from flowlab.records import Queries
+from flowlab.sim.exact_tracks import RigidFlowSettings, rigid_tracks
 from flowlab.sim.recorder import Rollout
-from flowlab.sim.tracks import RigidFlowSettings, rigid_tracks
 from flowlab.training.validation import MOVING_M
 
 _DIGITS = 4

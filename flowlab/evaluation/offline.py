@@ -5,7 +5,7 @@ from pathlib import Path
 
 from flowlab.config import Settings
 from flowlab.data.batch_builder import BatchBuilder
-from flowlab.data.query_points import choose_queries
+from flowlab.data.query_subset import choose_queries
 from flowlab.data.window_sampler import WindowIndex, index_windows
 from flowlab.evaluation.flow_metrics import FlowErrors, pool_errors
 from flowlab.evaluation.held_out import HeldOut, open_held_out

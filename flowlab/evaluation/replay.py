@@ -15,9 +15,9 @@ from flowlab.pipeline.stages.shared import ObserverStage, labeled
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
 from flowlab.records import Episode, FlowPrediction, ObservedDemo, QueriedDemo, Queries
+from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
 from flowlab.sim.simulation import SceneSettings
-from flowlab.sim.tracks import RigidFlowSettings, label
 
 _TALLEST_PX = 480
 """MetaWorld's models let OpenGL draw no more rows than this."""

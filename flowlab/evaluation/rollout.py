@@ -13,6 +13,7 @@ from flowlab.deployment.runner import PolicyRunner
 from flowlab.errors import DataError
 from flowlab.evaluation.flow_error import flow_error
 from flowlab.evaluation.results import EpisodeResult
+from flowlab.evaluation.success import solved_for_dp3
 from flowlab.evaluation.trials import Trial
 from flowlab.policies.base import ActionPlan, PolicyNetwork
 from flowlab.records import Queries
@@ -24,8 +25,6 @@ MAX_STEPS = 200
 BATCH_SLOTS = 4
 """Windows of every plan. More hardly cost less each (on a CPU, the encoder's products are large enough), and each
 needs a simulation of its own."""
-_DP3_CHECKED_STEPS = 2
-"""Of the executed steps of a plan, DP3's runner keeps the success of the last so many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +156,7 @@ class _RunningEpisode:
             self.recorder.step(np.clip(self.runner.next_action(), -1, 1))
             done = self.recorder.success[began:]
             if self.runner.needs_plan or began + len(done) == self.max_steps:
-                self.success_dp3 |= any(done[-_DP3_CHECKED_STEPS:])
+                self.success_dp3 |= solved_for_dp3(done)
             self.observe()
             if self.recorder.unstable:
                 self.note = "the physics became unstable"

@@ -13,7 +13,7 @@ from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
 from flowlab.perception.cleaning import SWITCH
-from flowlab.perception.observer import pad
+from flowlab.perception.point_cloud import pad
 from flowlab.records import Cloud, Queries, Role
 
 

@@ -15,7 +15,8 @@ from flowlab.pipeline.scheduling import ExtractionProgress, SeedScheduler
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.units import JobShard
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import Manifest, read_receipts
+from flowlab.storage.manifest import Manifest
+from flowlab.storage.receipts import read_receipts
 from flowlab.storage.schema import SCHEMA
 
 

@@ -14,7 +14,8 @@ from flowlab.pipeline.scheduling import ExtractionProgress, UnitScheduler
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.pipeline.worker import run_unit
 from flowlab.storage.dataset import Dataset, begin, summarize
-from flowlab.storage.manifest import Manifest, Receipt, read_receipts
+from flowlab.storage.manifest import Manifest
+from flowlab.storage.receipts import Receipt, read_receipts
 
 _SECONDS_BETWEEN_SUMMARIES = 5.0
 

@@ -16,7 +16,8 @@ from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.recordings.metadata import FILE_NAME, combine, load_metadata
 from flowlab.recordings.recording import RecordingSettings, find_recordings
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import Manifest, Receipt, read_receipts
+from flowlab.storage.manifest import Manifest
+from flowlab.storage.receipts import Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
 
 

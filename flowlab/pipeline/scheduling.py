@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from flowlab.pipeline.units import JobShard, WorkUnit
-from flowlab.storage.manifest import Receipt
+from flowlab.storage.receipts import Receipt
 from flowlab.storage.recorded import Recorded
 
 

@@ -10,7 +10,7 @@ from flowlab.config import Settings
 from flowlab.errors import FlowlabError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.records import Demonstration, Episode
-from flowlab.storage.manifest import StageTally
+from flowlab.storage.receipts import StageTally
 
 
 class Rejected(FlowlabError):

@@ -10,8 +10,7 @@ from flowlab.pipeline.stage import Pipeline, Rejected
 from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode
 from flowlab.storage import stats
-from flowlab.storage.dataset import keep_receipt
-from flowlab.storage.manifest import Receipt, Reject
+from flowlab.storage.receipts import Receipt, Reject, keep_receipt
 from flowlab.storage.shard import episode_digest
 
 

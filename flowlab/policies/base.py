@@ -16,10 +16,10 @@ from flowlab.data.channels import ChannelSpec
 from flowlab.data.needs import Needs
 from flowlab.data.normalizer import Normalizer
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError
 from flowlab.nets.diffusion import NoiseSampler
-from flowlab.policies.settings import AnyTrainSettings
+from flowlab.policies.profiles import AnyTrainSettings
 from flowlab.registry import POLICIES
 
 Generators = torch.Generator | Sequence[torch.Generator] | None

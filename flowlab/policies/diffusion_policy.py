@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import CloudNeeds, Needs
 from flowlab.data.normalizer import Scaler
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.nets.denoiser import make_denoiser
 from flowlab.nets.diffusion import Diffusion, NoiseSampler
 from flowlab.nets.motion import MotionHead, MotionLoss

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from flowlab.storage.manifest import Manifest, Receipt
+from flowlab.storage.manifest import Manifest
+from flowlab.storage.receipts import Receipt
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA
 
 _CARD = """---

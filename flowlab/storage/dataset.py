@@ -16,7 +16,8 @@ from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
 from flowlab.storage.episodes import EpisodeRef, EpisodeSequence
-from flowlab.storage.manifest import MANIFEST, Manifest, Receipt, differences, read_receipts
+from flowlab.storage.manifest import MANIFEST, Manifest, differences
+from flowlab.storage.receipts import read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.shard import Shard
 
@@ -225,11 +226,6 @@ def _check_settings(folder: Path, old: Manifest, manifest: Manifest) -> None:
             f"{folder}: made with other settings, and one dataset has one setting. "
             f"Choose another --out, or the same settings:\n  " + "\n  ".join(lines)
         )
-
-
-def keep_receipt(folder: Path, receipt: Receipt) -> None:
-    """Write a unit's receipt: from now on its shard counts."""
-    write_json(folder / "receipts" / f"{receipt.unit}.json", json.loads(receipt.model_dump_json()))
 
 
 def summarize(folder: Path) -> Dataset:

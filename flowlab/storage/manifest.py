@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError, model_validator
+from pydantic import ValidationError
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.files import read_json
 from flowlab.provenance import Provenance
-from flowlab.storage.migrations import migrate_manifest, migrate_receipt
+from flowlab.storage.migrations import migrate_manifest
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.version import __version__
@@ -73,93 +73,6 @@ class Manifest(Settings):
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"]))
             raise DataError(f"{path}: field '{field}': {first['msg']}") from error
-
-
-class Reject(Settings):
-    """A seed, or a recording, that gave no episode, or none that is good enough."""
-
-    task: str
-    seed: int
-    stage: str
-    reason: str
-    source: str = ""
-    """Path of the recording."""
-    position: int | None = None
-    """Index of the episode within the shard of its unit's rejects; None where there is nothing to look at."""
-    retry: bool = False
-    """Whether the next run tries again, since the cause lies outside the dataset: a recording could not be opened."""
-
-
-class StageTally(Settings):
-    """What one stage did in a unit."""
-
-    calls: int = 0
-    cpu_s: float = 0.0
-    rejects: int = 0
-
-    def since(self, before: "StageTally") -> "StageTally":
-        """What was added after ``before``."""
-        return StageTally(
-            calls=self.calls - before.calls, cpu_s=self.cpu_s - before.cpu_s, rejects=self.rejects - before.rejects
-        )
-
-    def plus(self, other: "StageTally") -> "StageTally":
-        """Both together."""
-        return StageTally(
-            calls=self.calls + other.calls, cpu_s=self.cpu_s + other.cpu_s, rejects=self.rejects + other.rejects
-        )
-
-
-class Receipt(Settings):
-    """What became of one work unit; a shard without a receipt does not count."""
-
-    unit: str
-    task: str
-    seeds: tuple[int, ...]
-    """All seeds tried."""
-    accepted: tuple[int, ...]
-    """Those whose episodes the shard holds, in its order."""
-    frames: tuple[int, ...]
-    """Length of each of these episodes."""
-    rejects: tuple[Reject, ...] = ()
-    digests: tuple[str, ...]
-    """SHA-256 of each of these episodes."""
-    stages: Mapping[str, StageTally] = {}
-    stats: Mapping[str, Any] = {}
-    """Mergeable statistics, see :mod:`flowlab.storage.stats`."""
-    peak_memory_mb: float = 0.0
-    flowlab: str = __version__
-
-    @model_validator(mode="after")
-    def _lists_match(self) -> "Receipt":
-        if not len(self.accepted) == len(self.frames) == len(self.digests):
-            raise ValueError("accepted, frames and digests must be equally long")
-        return self
-
-    @property
-    def shard(self) -> str:
-        """Path of the shard below the dataset."""
-        return f"shards/{self.unit}.zarr"
-
-    @property
-    def rejects_shard(self) -> str:
-        """Path below the dataset of the shard that keeps rejected episodes, where there are any to keep."""
-        return f"rejects/{self.unit}.zarr"
-
-
-def read_receipts(folder: Path) -> list[Receipt]:
-    """All receipts of a dataset, by task and seed."""
-    receipts = []
-    for path in (folder / "receipts").glob("*.json"):
-        if path.name.startswith("."):
-            continue
-        try:
-            receipts.append(Receipt.model_validate(migrate_receipt(read_json(path))))
-        except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(map(str, first["loc"])) or "lists"
-            raise DataError(f"{path}: field '{field}': {first['msg']}") from error
-    return sorted(receipts, key=lambda r: (r.task, r.seeds))
 
 
 def differences(old: Any, new: Any, where: str = "") -> Iterator[str]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import StageTally
+from flowlab.storage.receipts import StageTally
 from flowlab.storage.shard import Shard, StoredArray
 
 

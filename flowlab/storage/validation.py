@@ -10,7 +10,8 @@ from flowlab.errors import DataError
 from flowlab.provenance import Provenance
 from flowlab.storage.checks import ArrayProblem, episode_problems
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import MANIFEST, Receipt
+from flowlab.storage.manifest import MANIFEST
+from flowlab.storage.receipts import Receipt
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA
 from flowlab.storage.shard import Shard, episode_digest
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from flowlab.config import Settings
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import Needs
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Losses, PolicyNetwork, PolicySpec
 from flowlab.testing.policy_problem import ACTION, PICTURE, Problem, make_problem

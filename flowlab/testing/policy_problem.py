@@ -14,7 +14,7 @@ from flowlab.data.normalizer import Normalizer, Scale
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
 from flowlab.data.window_sampler import index_windows
 from flowlab.policies.base import PolicyNetwork, PolicySpec
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.records import Role
 
 TASKS = ("pour", "roll")

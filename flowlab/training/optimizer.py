@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from flowlab.data.settings import OptimizerSettings
+from flowlab.data.training_settings import OptimizerSettings
 from flowlab.policies.base import PolicyNetwork
 
 Tensors = dict[str, Tensor]

@@ -14,8 +14,8 @@ from flowlab.config import Settings
 from flowlab.data.channels import infer_channels
 from flowlab.data.normalizer import fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
-from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError, UsageError
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (

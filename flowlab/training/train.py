@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.policies.checkpoint import writing_run
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import METRICS, last_metrics
 from flowlab.training.run import ComputeSettings, Precision, prepare_run, resume_run, run
@@ -103,7 +103,7 @@ def train(
         out: Folder of the run, which must not hold one yet.
         policy: ``fdp``, ``dp3``, ``mba``, what an installed package offers, or ``module:Class``, whose module may lie
             in the current folder.
-        profile: ``fast``, ``paper``, or a YAML file; see :func:`~flowlab.policies.settings.load_settings`.
+        profile: ``fast``, ``paper``, or a YAML file; see :func:`~flowlab.policies.profiles.load_settings`.
         minutes: How long, in CPU time of one thread, or on a GPU by the clock; None leaves it to the profile.
         settings: Single changes, ``key.path=value``.
         seed: Short for the setting ``run.seed``.

@@ -10,14 +10,15 @@ import torch
 from builders import HAND, every_window, random_buffer, tiny_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.needs import CloudNeeds, FlowNeeds, Needs
-from flowlab.data.query_points import choose_queries
+from flowlab.data.query_subset import choose_queries
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.settings import BatchSettings, TrainSettings
+from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.data.window_sampler import WindowIndex, WindowSampler, index_windows
 from flowlab.errors import DataError, UsageError
 from flowlab.policies.fdp import FDPSettings
@@ -70,7 +71,7 @@ def numbered(count: int) -> WindowIndex:
     return WindowIndex(np.arange(count) // 10, np.arange(count), np.zeros(count, int))
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=examples(80), deadline=None, derandomize=True)
 @given(
     count=st.integers(1, 60),
     segment=st.integers(1, 9),

@@ -12,8 +12,8 @@ from synthetic import make_dataset, make_episode, with_tracks
 from flowlab.data.channels import ChannelSpec, infer_channels
 from flowlab.data.normalizer import Normalizer, Scale, Scaler, fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
-from flowlab.data.settings import TrainSettings
 from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.training_settings import TrainSettings
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.dp3 import DP3Exporter

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import make_dataset, make_episode, with_quality
+from thoroughness import examples
 from torch.utils.data import DataLoader
 
 import flowlab
@@ -67,7 +68,7 @@ KEYS = ("point_cloud", "point_count", "state", "action", "success", "time", "tra
         "object_pose", "rgb", "depth")  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=examples(60), deadline=None, derandomize=True)
 @given(
     offsets=st.dictionaries(st.sampled_from(KEYS), st.lists(st.integers(-20, 20), min_size=1, max_size=5), min_size=1),
     chosen=st.lists(st.integers(0, 3), min_size=1, max_size=4, unique=True),

@@ -15,7 +15,7 @@ from trained_runs import SMALL, make_rolls, make_run
 
 import flowlab
 from flowlab.data.batches import ObservationBatch
-from flowlab.deployment.policy import Policy
+from flowlab.deployment.robot_policy import Policy
 from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.evaluation.rollout import BATCH_SLOTS, PolicyRollout, SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
@@ -135,7 +135,7 @@ def test_the_name_is_in_the_package_and_costs_nothing_until_it_is_used() -> None
     script = (
         "import sys, flowlab; assert 'torch' not in sys.modules and 'numpy' not in sys.modules\n"
         "from flowlab import Policy; assert 'torch' in sys.modules and 'mujoco' not in sys.modules\n"
-        "assert Policy is flowlab.Policy and Policy.__module__ == 'flowlab.deployment.policy'\n"
+        "assert Policy is flowlab.Policy and Policy.__module__ == 'flowlab.deployment.robot_policy'\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
     with pytest.raises(AttributeError, match="'flowlab' has no attribute 'Police'"):
@@ -330,9 +330,9 @@ import numpy as np
 from flowlab import Policy
 from flowlab.geometry import sampling
 from flowlab.geometry.camera import Camera
-from flowlab.perception import observer
+from flowlab.perception import point_cloud
 from flowlab.records import Frame
-compiled = lambda: [len(f.signatures) for f in (observer._unproject_and_crop, sampling._farthest)]
+compiled = lambda: [len(f.signatures) for f in (point_cloud.unproject_and_crop, sampling._farthest)]
 policy = Policy.load({str(run)!r})
 assert compiled() == [0, 0]
 policy.warm_up()

@@ -12,8 +12,8 @@ from synthetic import CAMERA
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.needs import Needs
-from flowlab.data.settings import BatchSettings, TrainSettings
-from flowlab.deployment.policy import Policy
+from flowlab.data.training_settings import BatchSettings, TrainSettings
+from flowlab.deployment.robot_policy import Policy
 from flowlab.errors import DataError, MissingLibraryError, UsageError
 from flowlab.evaluation.checkpoints import find_checkpoint
 from flowlab.evaluation.evaluate import evaluate

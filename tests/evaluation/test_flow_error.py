@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.evaluation.flow_error import flow_error
 from flowlab.evaluation.results import RolloutFlowError
@@ -138,7 +139,7 @@ def test_the_case_has_points_that_move_and_points_that_do_not(case: Case) -> Non
     assert (reach < 1e-4).sum() >= 3
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     n_action_steps=st.integers(1, PLANNED),
     noise=st.sampled_from([0.0, 0.001, 0.01]),
@@ -202,7 +203,7 @@ def test_where_nothing_moves_there_is_nothing_to_say(case: Case) -> None:
     assert flow_error(case.rollout, queries, predicted, 8) is None
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_figures_are_the_same_in_any_world(case: Case, seed: int) -> None:
     """Tracks, query points and flow are in the dataset's world, which need not be MuJoCo's."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from run_example import EXAMPLES
 
-from flowlab.deployment.policy import Policy
+from flowlab.deployment.robot_policy import Policy
 from flowlab.errors import UsageError
 from flowlab.policies.base import PolicyNetwork
 from flowlab.records import Frame

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.geometry.camera import Camera
 
@@ -39,7 +40,7 @@ def facing_x() -> Camera:
     return Camera(4, 3, np.array([[100, 0, 1.5], [0, 100, 1], [0, 0, 1.0]]), T)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=examples(200), deadline=None, derandomize=True)
 @given(camera=cameras, seed=st.integers(0, 10**6))
 def test_unproject_undoes_project(camera: Camera, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -50,7 +51,7 @@ def test_unproject_undoes_project(camera: Camera, seed: int) -> None:
     np.testing.assert_allclose(uv_again, uv, atol=1e-6)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=examples(100), deadline=None, derandomize=True)
 @given(camera=cameras, seed=st.integers(0, 10**6))
 def test_project_is_the_homogeneous_textbook_formula(camera: Camera, seed: int) -> None:
     xyz = np.random.default_rng(seed).uniform(-3, 3, (20, 3))

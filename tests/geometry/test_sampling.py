@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from thoroughness import examples
 
 from flowlab.geometry.sampling import farthest_points
 
@@ -51,20 +52,20 @@ lines = st.builds(
 clouds = st.one_of(any_cloud(), any_cloud(2**-10), lattices, big_clouds, lines)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(xyz=clouds, k=st.integers(0, 90))
 def test_same_indices_as_the_textbook_loop(xyz: np.ndarray, k: int) -> None:
     assert farthest_points(xyz, k).tolist() == textbook(xyz, k)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=examples(100), deadline=None, derandomize=True)
 @given(xyz=clouds, k=st.integers(1, 60), data=st.data())
 def test_the_first_m_of_k_are_the_sample_of_m(xyz: np.ndarray, k: int, data: st.DataObject) -> None:
     m = data.draw(st.integers(0, k))
     assert farthest_points(xyz, m).tolist() == farthest_points(xyz, k)[:m].tolist()
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(xyz=clouds, k=st.integers(0, 60), data=st.data())
 def test_goes_on_from_chosen_points_as_if_it_had_picked_them(xyz: np.ndarray, k: int, data: st.DataObject) -> None:
     chosen = data.draw(st.lists(st.integers(0, len(xyz) - 1), max_size=min(10, len(xyz)), unique=True))

@@ -4,11 +4,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.geometry.transforms import apply, inverse, pose_9d, rigid, rotation_from_6d
 
 seeds = st.integers(0, 10**6)
-thoroughly = settings(max_examples=100, deadline=None, derandomize=True)
+thoroughly = settings(max_examples=examples(100), deadline=None, derandomize=True)
 
 
 def transforms(seed: int, n: int = 6) -> np.ndarray:

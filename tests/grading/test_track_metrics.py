@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import spearmanr
+from thoroughness import examples
 
 from flowlab.geometry.camera import Camera
 from flowlab.grading.calibration import SIGMA_EDGES_MM, calibrate, rank_correlation
@@ -245,7 +246,7 @@ def test_rank_correlation_is_spearmans(a: np.ndarray, b: np.ndarray) -> None:
         assert rank_correlation(a, b) == pytest.approx(spearmanr(a, b).statistic, abs=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(st.integers(0, 10**6))
 def test_what_holds_for_any_tracks(seed: int) -> None:
     truth = make_truth(seed)
@@ -273,7 +274,7 @@ def test_what_holds_for_any_tracks(seed: int) -> None:
     assert shuffled.survival == pytest.approx(m.survival)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(st.integers(0, 10**6), st.floats(1.1, 5))
 def test_larger_errors_never_score_better(seed: int, factor: float) -> None:
     truth = make_truth(seed)

@@ -27,7 +27,7 @@ from flowlab.nets.denoiser import (
 )
 from flowlab.nets.settings import DenoiserSettings
 from flowlab.policies.base import make_policy
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 
 HORIZON, CHANNELS, CONDITION, STEPS = 8, 3, 5, 20
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 from torch import Tensor, nn
 
 from flowlab.nets import encoder
@@ -48,7 +49,7 @@ def make_net(widths: tuple[int, ...] = (16, 24), octaves: int = 2, features: int
     return net
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=examples(40), deadline=None, derandomize=True)
 @given(
     clouds=st.integers(1, 5),
     size=st.integers(1, 40),

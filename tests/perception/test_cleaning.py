@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.config import SettingsError
 from flowlab.errors import MissingLibraryError
@@ -31,7 +32,7 @@ def scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(parts), np.repeat([0, 1, 2], [len(p) for p in parts])
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=examples(25), deadline=None, derandomize=True)
 @given(st.integers(0, 10**6))
 def test_what_stands_on_the_table_stays_and_the_rest_goes_wherever_the_table_is(seed: int) -> None:
     xyz, kind = scene(seed)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
@@ -54,7 +55,7 @@ def observer(**values: Any) -> Observer:
     return Observer(ObserverSettings(**{"crop": EVERYWHERE, "points": 50, **values}), "hammer")
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=examples(50), deadline=None, derandomize=True)
 @given(st.integers(0, 10**6))
 def test_every_point_of_a_tilted_plane_lies_on_it(seed: int) -> None:
     cam = camera(seed)
@@ -70,7 +71,7 @@ def test_every_point_of_a_tilted_plane_lies_on_it(seed: int) -> None:
     assert cloud.owner is None
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=examples(50), deadline=None, derandomize=True)
 @given(st.integers(0, 10**6))
 def test_the_cloud_is_what_a_mask_keeps_in_pixel_order(seed: int) -> None:
     frame = picture(camera(seed), seed)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
@@ -73,7 +74,7 @@ def test_few_object_points_are_repeated_and_counted() -> None:
     assert (owner == CUP).all()
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=examples(60), deadline=None, derandomize=True)
 @given(st.integers(2, 120), st.floats(0.01, 0.99), st.integers(0, 80), st.integers(100, 400), st.integers(0, 1000))
 def test_stratified_queries_keep_their_promise(points: int, share: float, objects: int, n: int, seed: int) -> None:
     cloud = scene(n, min(objects, n), seed)

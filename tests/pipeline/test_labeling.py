@@ -21,7 +21,7 @@ from flowlab.pipeline.stages.recording import LiftStage, QualityStage, TrackStag
 from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode, PositionSource, QueriedDemo
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import Receipt
+from flowlab.storage.receipts import Receipt
 from flowlab.storage.validation import validate
 
 SMALL = ("track.tracker=lucas-kanade", "observer.points=256", "queries.points=40")

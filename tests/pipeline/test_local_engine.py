@@ -16,7 +16,7 @@ from flowlab.engines.base import UnitResult
 from flowlab.engines.local import LocalEngine
 from flowlab.errors import DataError
 from flowlab.pipeline.units import WorkUnit
-from flowlab.storage.manifest import Receipt
+from flowlab.storage.receipts import Receipt
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
 UNLUCKY = 1

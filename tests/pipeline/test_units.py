@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.engines.base import UnitResult
 from flowlab.errors import UsageError
 from flowlab.pipeline.filling import run_all
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler, SeedScheduler, next_units, unit_size
 from flowlab.pipeline.units import JobShard, WorkUnit
-from flowlab.storage.dataset import keep_receipt
-from flowlab.storage.manifest import Receipt, Reject, read_receipts
+from flowlab.storage.receipts import Receipt, Reject, keep_receipt, read_receipts
 from flowlab.storage.recorded import Recorded
 
 TASKS = ("push", "roll")
@@ -135,7 +135,7 @@ def first_round_names(task: str, wanted: int, first_seed: int) -> set[str]:
     return names
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(
     wanted=st.fixed_dictionaries({t: st.integers(1, 12) | st.sampled_from([40, 70]) for t in TASKS}),
     first_seed=st.integers(0, 50),
@@ -185,7 +185,7 @@ def test_any_way_to_run_gives_the_first_successes_in_seed_order(
         assert first_round_names(task, n, first_seed) <= names
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=4), st.integers(0, 2**31))
 def test_extending_a_dataset_step_by_step_gives_the_same_seeds(
     tmp_path_factory: pytest.TempPathFactory, requests: list[int], seed: int
@@ -242,7 +242,7 @@ def recordings(n: int) -> list[Recorded]:
     return [Recorded(task=TASKS[k % 2], name=f"take {k}", seed=k, source=f"/rec/{k}") for k in range(n)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     counts=st.lists(st.integers(0, 12), min_size=1, max_size=3),
     shares=st.integers(1, 4),

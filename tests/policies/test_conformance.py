@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import Needs
-from flowlab.data.settings import BatchSettings, TrainSettings
+from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
 from flowlab.policies.dp3 import DP3

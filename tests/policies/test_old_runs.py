@@ -11,7 +11,7 @@ import pytest
 from safetensors.torch import load_file
 from synthetic import call_cli
 
-from flowlab.deployment.policy import Policy
+from flowlab.deployment.robot_policy import Policy
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.policies.checkpoint import load_policy, read_trained

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_recordings import colors, counts
+from thoroughness import examples
 
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.image_files import (
@@ -39,14 +40,14 @@ def test_pictures_come_back_as_they_were() -> None:
     assert np.abs(decode_color(jpeg(RGB)).astype(int) - RGB).mean() < 4
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(st.sampled_from([png(RGB), png(DEPTH)]), st.floats(0, 1, exclude_max=True))
 def test_a_png_cut_anywhere_is_bad(content: bytes, share: float) -> None:
     with pytest.raises(BadImage, match=r"is empty|truncated|cannot be decoded"):
         decode_color(content[: int(share * len(content))])
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(st.integers(8, len(png(DEPTH)) - 1), st.integers(1, 255))
 def test_a_png_with_any_byte_changed_is_bad(at: int, change: int) -> None:
     content = bytearray(png(DEPTH))

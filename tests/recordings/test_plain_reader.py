@@ -22,6 +22,7 @@ from real_recordings import (
     opened,
     write_folder,
 )
+from thoroughness import examples
 
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
@@ -42,7 +43,7 @@ def write(folder: Path, **changes: Any) -> Path:
     return folder
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=examples(10), deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.booleans())
 def test_what_is_written_is_read_back_exactly(
     tmp_path_factory: pytest.TempPathFactory, seed: int, success: bool

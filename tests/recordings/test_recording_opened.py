@@ -23,6 +23,7 @@ from real_recordings import (
     write_png,
     write_yaml,
 )
+from thoroughness import examples
 
 from flowlab.errors import DataError, UsageError
 from flowlab.geometry.camera import Camera
@@ -163,7 +164,7 @@ def test_depth_is_taken_nearest_in_time(folder: Path) -> None:
     assert recording.time_s[0] == 0
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=examples(20), deadline=None, derandomize=True)
 @given(st.floats(-0.08, 0.08))
 def test_sync_error_decides_by_its_bound(tmp_path_factory: pytest.TempPathFactory, off: float) -> None:
     path = write_folder(tmp_path_factory.mktemp("rec") / "r", steps=3)
@@ -343,7 +344,7 @@ def test_distorted_pictures_are_straightened(tmp_path: Path) -> None:
 # --- size -------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=examples(60), deadline=None, derandomize=True)
 @given(st.integers(1, 6), st.floats(5, 60), st.floats(5, 40))
 def test_a_shrunk_camera_sees_the_middle_of_each_block(factor: int, cx: float, cy: float) -> None:
     """What lies at the center of a block of pixels lies at the center of the pixel made of it."""

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.recordings.metadata import Intrinsics
 from flowlab.recordings.registration import Registration
@@ -42,7 +43,7 @@ def test_the_same_camera_gives_the_same_picture() -> None:
     np.testing.assert_array_equal(move(depth), depth)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=examples(40), deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(0.4, 2.5), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_a_plane_is_where_it_is(seed: int, distance: float, a: float, b: float) -> None:
     T = pose(seed)

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.recordings.sync import find_gaps, last_sample, nearest_sample, sampling_rate
 
 instants = st.lists(st.integers(0, 40).map(lambda k: k / 8), min_size=1, max_size=40)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(instants, instants.map(sorted))
 def test_nearest_is_what_a_search_of_all_finds(clock: list[float], time_s: list[float]) -> None:
     found = nearest_sample(np.array(clock), np.array(time_s))
@@ -20,7 +21,7 @@ def test_nearest_is_what_a_search_of_all_finds(clock: list[float], time_s: list[
     np.testing.assert_array_equal(np.array(time_s)[found], ties)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(instants, instants.map(sorted))
 def test_previous_is_the_last_that_is_not_later(clock: list[float], time_s: list[float]) -> None:
     found = last_sample(np.array(clock), np.array(time_s))
@@ -29,7 +30,7 @@ def test_previous_is_the_last_that_is_not_later(clock: list[float], time_s: list
         assert k == (before[-1] if before else 0)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=examples(100), deadline=None, derandomize=True)
 @given(st.integers(3, 60), st.floats(0.001, 2), st.data())
 def test_missing_samples_are_gaps_and_nothing_else_is(count: int, step: float, data: st.DataObject) -> None:
     lost = data.draw(st.integers(1, count - 1))

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from thoroughness import examples
 
 from flowlab.sim.sensor import CLEAN, KINECT, PRESETS, Sensor, SensorSettings
 
@@ -154,7 +155,7 @@ def test_the_same_seed_sees_the_same() -> None:
     assert (first != a.depth(truth)).any(), "every picture has noise of its own"
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.floats(0.2, 8), st.floats(0.2, 8), st.integers(0, 99))
 def test_readings_are_sane(near: float, far: float, seed: int) -> None:
     read = Sensor(KINECT, seed).depth(box_before_wall(near, far)[40:100, 60:120])

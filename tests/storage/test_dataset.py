@@ -13,8 +13,9 @@ from conftest import Cli
 from synthetic import assert_same, files_below, make_dataset, make_episode, make_manifest, make_receipt, with_quality
 
 from flowlab.errors import DataError, UsageError
-from flowlab.storage.dataset import Dataset, begin, keep_receipt, open_dataset, summarize
-from flowlab.storage.manifest import MANIFEST, Receipt, Reject, StageTally
+from flowlab.storage.dataset import Dataset, begin, open_dataset, summarize
+from flowlab.storage.manifest import MANIFEST
+from flowlab.storage.receipts import Receipt, Reject, StageTally, keep_receipt
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.shard import Shard, write_shard
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.errors import DataError, UsageError
 from flowlab.storage.recorded import Recorded, number_recordings
@@ -33,7 +34,7 @@ def test_known_recordings_keep_their_numbers_and_new_ones_follow() -> None:
     assert number_recordings(second, [recorded("7")]) == second
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.lists(st.lists(st.integers(0, 30), max_size=8), max_size=6), st.randoms())
 def test_any_order_of_additions_gives_every_recording_one_number_for_good(
     batches: list[list[int]], dice: random.Random

@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import Zstd
 from synthetic import CAMERA, assert_same, make_episode, with_quality
+from thoroughness import examples
 
 from flowlab.errors import DataError
 from flowlab.files import remove_leftovers
@@ -63,7 +64,7 @@ json_values = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(
     lengths=st.lists(st.integers(1, 40), min_size=1, max_size=4),
     points=st.integers(1, 30),

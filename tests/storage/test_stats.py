@@ -12,6 +12,7 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import make_dataset, make_episode, make_manifest, with_quality, with_tracks
+from thoroughness import examples
 
 from flowlab.records import Episode, PositionSource
 from flowlab.storage import stats
@@ -39,7 +40,7 @@ def check_limits_and_moments(found: dict[str, Any], parts: dict[str, list[np.nda
         np.testing.assert_allclose(values["std"], whole.std(0), rtol=1e-7, atol=1e-10)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     lengths=st.lists(st.integers(1, 30), min_size=1, max_size=8),
     with_pose=st.lists(st.booleans(), min_size=8, max_size=8),
@@ -67,7 +68,7 @@ def test_merging_any_split_in_any_order_gives_the_statistics_of_all(
 steps_m = st.floats(2e-6, 0.9) | st.sampled_from([0.99e-4, 1.01e-4])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.lists(steps_m, min_size=1, max_size=40) | st.lists(steps_m | st.just(0.0), min_size=1, max_size=40))
 def test_motion_is_right_to_6_percent(lengths: list[float]) -> None:
     """One point that makes these steps along x: numpy's quantiles are the truth."""

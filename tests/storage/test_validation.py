@@ -14,8 +14,8 @@ from conftest import Cli
 from synthetic import call_cli, make_dataset, make_episode, make_receipt, with_quality, with_tracks
 
 from flowlab.records import Episode, PositionSource
-from flowlab.storage.dataset import Dataset, keep_receipt
-from flowlab.storage.manifest import Reject
+from flowlab.storage.dataset import Dataset
+from flowlab.storage.receipts import Reject, keep_receipt
 from flowlab.storage.shard import Shard, episode_digest, write_shard
 from flowlab.storage.validation import validate
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import apply
@@ -234,7 +235,7 @@ def test_scatter_that_grows_with_distance_is_no_occlusion() -> None:
 
 
 @given(seed=st.integers(0, 10_000), holes=st.floats(0, 1), layers=st.integers(1, 3))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_what_is_measured_was_read_beside_the_point(seed: int, holes: float, layers: int) -> None:
     rng = np.random.default_rng(seed)
     depth = rng.choice(rng.uniform(0.3, 2, layers), (8, 12, 16)) * (rng.random((8, 12, 16)) > holes)

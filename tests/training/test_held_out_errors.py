@@ -12,7 +12,7 @@ from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.data.window_sampler import WindowIndex
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, make_policy

@@ -31,7 +31,7 @@ from trained_runs import (
     without_times,
 )
 
-from flowlab.policies.settings import load_settings
+from flowlab.policies.profiles import load_settings
 from flowlab.training import run as training_run
 
 Capture = pytest.CaptureFixture[str]

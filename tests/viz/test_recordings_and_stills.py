@@ -22,8 +22,8 @@ from synthetic import (
 
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
-from flowlab.storage.dataset import begin, keep_receipt
-from flowlab.storage.manifest import Reject
+from flowlab.storage.dataset import begin
+from flowlab.storage.receipts import Reject, keep_receipt
 from flowlab.storage.shard import write_shard
 from flowlab.viz.blueprint import make_blueprint
 from flowlab.viz.captions import caption, describe, moving

@@ -6,9 +6,9 @@ from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.shared import AcceptStage, ObserverStage, QueriesStage, WriteStage, labeled
 from flowlab.provenance import Provenance
 from flowlab.records import Episode, QueriedDemo
+from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import ExpertSettings, Rollout, TaskSimulator
 from flowlab.sim.simulation import SceneSettings, describe_scene
-from flowlab.sim.tracks import RigidFlowSettings, label
 
 __all__ = ["AcceptStage", "ExpertStage", "ObserverStage", "QueriesStage", "RigidFlowStage", "WriteStage"]
 

@@ -8,9 +8,9 @@ from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, new_body, region_pixels
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.merging import merge, neighbors
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import MotionGrid, segment_motion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def fit_of(scene: Scene, owner: np.ndarray, motions: list[RigidMotion]) -> RigidBodyFit:

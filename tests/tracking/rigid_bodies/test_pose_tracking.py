@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigid_body_scenes import FRAMES, Scene, scene, still_camera_moves, two_plates
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _gauss_newton
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody, track_poses
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def align(scene: Scene, k: int, t: int, R: np.ndarray, s: np.ndarray, iterations: int = 10) -> tuple[np.ndarray, ...]:
@@ -33,7 +34,7 @@ def off(scene: Scene, k: int, t: int, R: np.ndarray, s: np.ndarray) -> float:
     return float(np.linalg.norm(points @ (R - truth.R[t]).T + (s - truth.t[t]), axis=1).mean())
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=examples(20), deadline=None, derandomize=True)
 @given(
     turn=st.lists(st.floats(-0.02, 0.02), min_size=3, max_size=3),
     shift=st.lists(st.floats(-0.004, 0.004), min_size=3, max_size=3),

@@ -6,10 +6,10 @@ from rigid_body_scenes import FRAMES, Scene, scene, two_plates
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import assign
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def fit_of(seen: Scene, *motions: RigidMotion) -> RigidBodyFit:

@@ -5,9 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.proposals import MIN_SEEDS, Trajectories, propose_motions, track_seeds
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def motion(seed: int, frames: int = 20, still: bool = False) -> RigidMotion:
@@ -32,7 +33,7 @@ def trajectories(motions: list[RigidMotion], sizes: list[int], strays: int = 0, 
     return Trajectories(pixels, xyz, np.ones(xyz.shape[:2], bool))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=examples(15), deadline=None, derandomize=True)
 @given(st.integers(0, 1000))
 def test_each_motion_is_proposed_once_with_all_who_follow_it(seed: int) -> None:
     truth = [motion(seed), motion(seed + 1001)]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, fit_rigid, nearest_rotation
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid, nearest_rotation
 
 vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3)
 

@@ -8,8 +8,8 @@ from jaxtyping import Float, Float32, Int64, Num
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 _FRAMES = 32
 """Frames that are looked at."""

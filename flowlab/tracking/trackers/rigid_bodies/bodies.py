@@ -8,9 +8,9 @@ from jaxtyping import Bool, Integer
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, assign, select_needed
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from jaxtyping import Int64
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, changed_body
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody, track_poses
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 _MAX_PAIRS = 10
 _SLACK = 0.04

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int32
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _gauss_newton
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, fit_rigid, nearest_rotation
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid, nearest_rotation
 
 _POINTS_PER_BODY = 400
 """Points a body is tracked by."""

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from flowlab.tracking.trackers.rigid_bodies._costs import inlier_shares
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.motion import RigidMotion, fit_rigid
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid
 
 MIN_SEEDS = 8
 """Fewer trajectories prove no motion."""

@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float, Float32, Int, Int8
 
 from flowlab.geometry.transforms import apply, inverse
 from flowlab.records import Frame, Queries
+from flowlab.sim.exact_tracks import RigidFlowSettings, rigid_tracks
 from flowlab.sim.recorder import Rollout
-from flowlab.sim.tracks import RigidFlowSettings, rigid_tracks
 
 RAY_TOLERANCE_M = 0.003
 """A ray that ends this close before a point has met the surface the point itself lies on."""

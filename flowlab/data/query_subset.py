@@ -9,7 +9,7 @@ from flowlab.data.needs import FlowNeeds
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.errors import DataError
 from flowlab.geometry.sampling import farthest_points
-from flowlab.perception.observer import pad
+from flowlab.perception.point_cloud import pad
 from flowlab.records import Role
 
 

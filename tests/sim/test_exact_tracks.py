@@ -14,8 +14,8 @@ from flowlab.geometry.camera import Camera
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.stage import EpisodeRequest
 from flowlab.records import Episode, ObservedDemo, QueriedDemo, Role
+from flowlab.sim.exact_tracks import RigidFlowSettings, rigid_tracks, visibility
 from flowlab.sim.recorder import Rollout
-from flowlab.sim.tracks import RigidFlowSettings, rigid_tracks, visibility
 
 DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 

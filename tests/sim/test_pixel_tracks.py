@@ -7,10 +7,10 @@ import pytest
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import rigid
 from flowlab.records import Role
+from flowlab.sim.pixel_tracks import surface_tracks, visible_by_rays
 from flowlab.sim.recorder import Rollout
 from flowlab.sim.render.zbuffer import ZBuffer
 from flowlab.sim.scene import Poses, Scene
-from flowlab.sim.surface_tracks import surface_tracks, visible_by_rays
 
 WORLD = """
 <mujoco><worldbody>

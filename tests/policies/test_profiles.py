@@ -10,11 +10,11 @@ import yaml
 
 from flowlab.config import Settings
 from flowlab.data.needs import Needs
-from flowlab.data.settings import BatchSettings, TrainSettings
+from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.errors import UsageError
 from flowlab.policies.fdp import FDPSettings
 from flowlab.policies.migrations import migrate_policy
-from flowlab.policies.settings import load_settings, settings_class
+from flowlab.policies.profiles import load_settings, settings_class
 
 PROFILES = Path(__file__).parents[2] / "pipelines/train"
 POLICIES = ["fdp", "dp3", "mba"]

@@ -8,7 +8,7 @@ import yaml
 from pydantic import BeforeValidator, SerializeAsAny, ValidationError
 
 from flowlab.config import Settings, explain, merge, override, read_named
-from flowlab.data.settings import TrainSettings
+from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.registry import POLICIES
 
