@@ -16,7 +16,7 @@ from flowlab.records import Episode
 
 INDEX = "index.json"
 """Written last: a folder that has it is whole."""
-_FORMAT = 2
+_FORMAT = 3
 ArraysOf = Callable[[Episode], tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]]
 """Takes out of an episode what is cached: arrays with a row per frame, and arrays of the whole episode."""
 
