@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
@@ -58,10 +58,7 @@ class EpisodeSequence(Sequence[Episode], ABC):
         """
         if isinstance(index, slice):
             return DatasetView(self.path, self.refs[index])
-        if not hasattr(index, "__index__"):
-            how = f"episodes of one task are dataset.task({index!r})" if isinstance(index, str) else "as in dataset[2]"
-            raise UsageError(f"{self.path}: episodes are numbered, and found a {type(index).__name__}; {how}")
-        index = operator.index(index)
+        index = self._position(index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
         ref = self.refs[index]
@@ -96,6 +93,13 @@ class EpisodeSequence(Sequence[Episode], ABC):
             if (self.refs[k].task, self.refs[k].seed) == (task, seed):
                 return k
         raise ValueError(f"{self.path}: no episode of {task} has the seed {seed}")
+
+    def _position(self, index: Any) -> int:
+        """An index as a number, which NumPy's are, too."""
+        if hasattr(index, "__index__"):
+            return operator.index(index)
+        how = f"episodes of one task are dataset.task({index!r})" if isinstance(index, str) else "as in dataset[2]"
+        raise UsageError(f"{self.path}: episodes are numbered, and found a {type(index).__name__}; {how}")
 
     def _identity(self, value: object) -> tuple[str, int]:
         """What tells an episode from all others of a dataset."""
