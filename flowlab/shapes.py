@@ -53,8 +53,10 @@ class Record:
         """Those lengths; None where anything may be wrong. Quick, for records are made at every step."""
         arrays, inner, fixed = _declared(type(self))  # type: ignore[arg-type]
         found = dict(fixed)
-        for name in inner:
+        for name, kinds in inner:
             value = getattr(self, name)
+            if not isinstance(value, kinds):
+                return None
             for dim, length in value.lengths().items() if isinstance(value, Record) else ():
                 if found.setdefault(dim, length) != length:
                     return None
@@ -75,8 +77,10 @@ class Record:
         """Length of every named dimension. Raises :class:`RecordError` where arrays do not agree."""
         found: dict[str, Size] = {}
         declared, inner, _ = _declared(type(self))  # type: ignore[arg-type]
-        for name in inner:
+        for name, kinds in inner:
             value = getattr(self, name)
+            if not isinstance(value, kinds):
+                raise self._wrong(name, f"is {_short(value)}, expected {_a(kinds[0].__name__)}")
             if isinstance(value, Record):
                 for dim, size in value.sizes().items():
                     self._check_size(found, dim, Size(size.length, f"{name}.{size.where}"))
@@ -125,14 +129,18 @@ class _Array:
     optional: bool
 
 
+_Inner = tuple[str, tuple[type, ...]]
+"""A field that holds a record: its name, and what may stand in it, such as Quality or None."""
+
+
 @cache
-def _declared(cls: type) -> tuple[tuple[_Array, ...], tuple[str, ...], dict[str | int, int]]:
-    """The arrays of a record, the names of the records in it, and the dimensions whose name is their length."""
+def _declared(cls: type) -> tuple[tuple[_Array, ...], tuple[_Inner, ...], dict[str | int, int]]:
+    """The arrays of a record, the records in it, and the dimensions whose name is their length."""
     hints = get_type_hints(cls)
     names = [f.name for f in fields(cls)]
     arrays = tuple(array for name in names if (array := _array(name, hints[name])) is not None)
     fixed: dict[str | int, int] = {dim: dim for array in arrays for dim in array.dims if isinstance(dim, int)}
-    return arrays, tuple(name for name in names if _is_record(hints[name])), fixed
+    return arrays, tuple((name, kinds) for name in names if (kinds := _record_types(hints[name]))), fixed
 
 
 def _array(name: str, hint: Any) -> _Array | None:
@@ -146,8 +154,15 @@ def _array(name: str, hint: Any) -> _Array | None:
     return None
 
 
-def _is_record(hint: Any) -> bool:
-    return any(isinstance(option, type) and issubclass(option, Record) for option in (get_args(hint) or (hint,)))
+def _record_types(hint: Any) -> tuple[type, ...]:
+    """What a field that is annotated as a record may hold, the record first; empty for other fields."""
+    options = [option for option in get_args(hint) or (hint,) if isinstance(option, type)]
+    records = [option for option in options if issubclass(option, Record)]
+    return (*records, *(option for option in options if option not in records)) if records else ()
+
+
+def _a(noun: str) -> str:
+    return f"{'an' if noun[0] in 'AEIOU' else 'a'} {noun}"
 
 
 def _shape(lengths: Sequence[int | str]) -> str:
@@ -172,7 +187,7 @@ def _short(value: Any) -> str:
         return f"{value.dtype}[{', '.join(map(str, value.shape))}]"
     if isinstance(value, str):
         return repr(value if len(value) <= _SHOWN_TEXT else f"{value[:_SHOWN_TEXT]}...")
-    if isinstance(value, bool | int | float | np.generic):
+    if value is None or isinstance(value, bool | int | float | np.generic):
         return str(value)
     if isinstance(value, Mapping):
         return f"{{{', '.join(_keys(value))}}}"

@@ -46,6 +46,16 @@ def queries(**changes: Any) -> Queries:
 WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "K is a pose": (lambda: camera(K=np.eye(4)), "Camera.K has the shape (4, 4), expected (3, 3)"),
     "pose is a rotation": (lambda: camera(T_world_cam=np.eye(3)), "Camera.T_world_cam has the shape (3, 3), expected"),
+    "no camera": (lambda: Frame(DEPTH, np.eye(4)), "Frame.camera is float64[4, 4], expected a Camera"),  # type: ignore[arg-type]
+    "camera is None": (lambda: Frame(DEPTH, None), "Frame.camera is None, expected a Camera"),  # type: ignore[arg-type]
+    "tracks of another kind": (
+        lambda: replace(EPISODE, tracks=EPISODE.queries),  # type: ignore[arg-type]
+        "Episode.tracks is Queries(...), expected a Tracks3D",
+    ),
+    "quality is an array": (
+        lambda: replace(EPISODE.tracks, quality=np.zeros(3)),  # type: ignore[arg-type]
+        "Tracks3D.quality is float64[3], expected a Quality",
+    ),
     "no pixels": (lambda: camera(width=0), "Camera.width is 0, expected a number of pixels above 0"),
     "not finite": (lambda: camera(T_world_cam=np.full((4, 4), np.nan)), "Camera.T_world_cam holds a number"),
     "focal length of 0": (lambda: camera(K=with_k(0, 0, 0)), "Camera.K has the focal lengths 0 and"),

@@ -41,6 +41,11 @@ def check_frame(frame: Frame) -> Frame:
     Raises:
         UsageError: Depth, color and camera do not fit each other, or depth is not in meters.
     """
+    if not isinstance(frame, Frame):
+        raise UsageError(
+            f"observation is {type(frame).__name__}, expected a Frame; give flowlab.Frame(depth, camera), with "
+            "rgb=picture for policies on color"
+        )
     depth, camera = np.asarray(frame.depth), frame.camera
     size = camera.height, camera.width
     if depth.shape != size:

@@ -256,6 +256,10 @@ def test_mistakes_are_told_in_a_sentence_and_the_step_can_be_done_again(run: Pat
     assert "depth has the shape (16, 12), and its camera has 12 rows and 16 columns" in refused(policy, turned, STATE)
     mm = changed(plate(), depth=(1000 * plate().depth).astype(np.uint16))
     assert "depth is uint16; give meters as float32" in refused(policy, mm, STATE)
+    assert refused(policy, plate().depth, STATE) == (  # type: ignore[arg-type]
+        "step 7: observation is ndarray, expected a Frame; give flowlab.Frame(depth, camera), with rgb=picture for "
+        "policies on color"
+    )
     flat = changed(plate(), camera=Camera(16, 12, CAMERA.K, CAMERA.T_world_cam))
     object.__setattr__(flat.camera, "T_world_cam", CAMERA.T_world_cam[:3])
     assert "camera.T_world_cam has the shape (3, 4), expected (4, 4)" in refused(policy, flat, STATE)
