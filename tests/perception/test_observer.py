@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from thoroughness import examples
 
+from flowlab.config import SettingsError
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.perception.observer import Box, Observer, ObserverSettings
@@ -158,7 +158,7 @@ def test_an_empty_crop_says_which_task_and_what_to_set() -> None:
 
 
 def test_a_box_must_hold_something() -> None:
-    with pytest.raises(ValidationError, match="must be below"):
+    with pytest.raises(SettingsError, match="must be below"):
         Box(low=(0, 1, 0), high=(1, 1, 1))
 
 
