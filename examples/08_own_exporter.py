@@ -35,13 +35,13 @@ class NpzExporter(Exporter):
 
     def export(self, dataset: Dataset, path: Path, task: str | None = None) -> int:
         """See :class:`~flowlab.storage.exporters.base.Exporter`."""
-        chosen = select_episodes(dataset, path, task)
+        chosen = {(ref.task, ref.seed) for ref in select_episodes(dataset, path, task)}
         with new_folder(path) as folder:
-            for ref in chosen:
-                episode = dataset[dataset.refs.index(ref)]
-                arrays = {"point_cloud": episode.point_cloud, "state": episode.state, "action": episode.action}
-                arrays |= {"tracks": episode.tracks.xyz_world} if self.tracks else {}
-                np.savez_compressed(folder / f"{ref.task}-{ref.seed:06d}.npz", **arrays)
+            for episode in dataset.episodes():
+                if (episode.task, episode.seed) in chosen:
+                    arrays = {"point_cloud": episode.point_cloud, "state": episode.state, "action": episode.action}
+                    arrays |= {"tracks": episode.tracks.xyz_world} if self.tracks else {}
+                    np.savez_compressed(folder / f"{episode.task}-{episode.seed:06d}.npz", **arrays)
         return len(chosen)
 
 

@@ -5,7 +5,7 @@
 
 An engine for a cluster sends ``work`` and a unit, both of which can be pickled, to a machine that sees the same disk,
 and hands back the receipt. A :class:`~flowlab.errors.FlowlabError` or an :class:`OSError` of the work ends the run; any
-other error is the failure of its unit alone, which the next run tries again. See `flowlab/engines/local.py` for processes.
+other error is the failure of its unit alone, which the next run tries again. `flowlab/engines/local.py` has processes.
 
 A package that offers the class as an entry point makes it known by name::
 

@@ -70,6 +70,13 @@ class Receipt(Settings):
     flowlab: str = __version__
 
     @model_validator(mode="after")
+    def _plain_names(self) -> "Receipt":
+        for name in (self.unit, self.task):
+            if not name or name.startswith(".") or "/" in name or "\0" in name:
+                raise ValueError(f"'{name}' is no plain name; unit and task name files of this dataset")
+        return self
+
+    @model_validator(mode="after")
     def _lists_match(self) -> "Receipt":
         if not len(self.accepted) == len(self.frames) == len(self.digests):
             raise ValueError("accepted, frames and digests must be equally long")
@@ -93,11 +100,14 @@ def read_receipts(folder: Path) -> list[Receipt]:
         if path.name.startswith("."):
             continue
         try:
-            receipts.append(Receipt.model_validate(migrate_receipt(read_json(path))))
+            receipt = Receipt.model_validate(migrate_receipt(read_json(path)))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"])) or "lists"
             raise DataError(f"{path}: field '{field}': {first['msg']}") from error
+        if receipt.unit != path.stem:
+            raise DataError(f"{path}: field 'unit': is '{receipt.unit}', expected '{path.stem}' as the file is called")
+        receipts.append(receipt)
     return sorted(receipts, key=lambda r: (r.task, r.seeds))
 
 
