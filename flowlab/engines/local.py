@@ -50,7 +50,7 @@ class _Worker(ForkServerProcess):
     """A process that imports what it works with, and never the script that asked for it."""
 
     @staticmethod
-    def _Popen(process_obj: Any) -> Any:  # noqa: N802 (multiprocessing's name)
+    def _Popen(process_obj: Any) -> Any:
         with _main_hidden():
             return ForkServerProcess._Popen(process_obj)  # type: ignore[attr-defined]
 

@@ -166,7 +166,8 @@ def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
         "import sys, pathlib, flowlab\n"
         "with open(sys.argv[1], 'a') as log:\n"
         "    log.write('ran ')\n"
-        "dataset = flowlab.extract('drawer-open', sys.argv[2], episodes=1, settings=['observer.points=64'], workers=1)\n"
+        "few = ['observer.points=64']\n"
+        "dataset = flowlab.extract('drawer-open', sys.argv[2], episodes=1, settings=few, workers=1)\n"
         "print(len(dataset))\n"
     )
     log = tmp_path / "log"
