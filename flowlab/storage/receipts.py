@@ -1,7 +1,8 @@
 """Receipts: one JSON record per work unit, that says what became of it and makes its shard count."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,22 @@ class StageTally(Settings):
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Widths:
+    """How many numbers a state and an action have, the same in all episodes of a dataset."""
+
+    state: int
+    action: int
+
+    def problem(self, other: "Widths") -> str:
+        """In what others differ from the dataset's, in words; empty where they do not."""
+        for name in ("state", "action"):
+            mine, found = getattr(self, name), getattr(other, name)
+            if mine != found:
+                return f"its {name} has {found} numbers a step, that of the dataset's other episodes {mine}"
+        return ""
+
+
 class Receipt(Settings):
     """What became of one work unit; a shard without a receipt does not count."""
 
@@ -88,6 +105,14 @@ class Receipt(Settings):
         return f"shards/{self.unit}.zarr"
 
     @property
+    def widths(self) -> "Widths | None":
+        """How many numbers a state and an action of its episodes have; None where that is not known."""
+        if not self.accepted or "arrays" not in self.stats:
+            return None
+        moments = self.stats["arrays"]
+        return Widths(*(len(moments[name]["mean"]) if name in moments else 0 for name in ("state", "action")))
+
+    @property
     def rejects_shard(self) -> str:
         """Path below the dataset of the shard that keeps rejected episodes, where there are any to keep."""
         return f"rejects/{self.unit}.zarr"
@@ -95,7 +120,31 @@ class Receipt(Settings):
 
 def read_receipts(folder: Path) -> list[Receipt]:
     """All receipts of a dataset, by task and seed."""
-    receipts = []
+    return sorted(_receipts(folder), key=lambda r: (r.task, r.seeds))
+
+
+def known_widths(folder: Path) -> Widths | None:
+    """What all episodes of a dataset have as state and action; None as long as there is no episode."""
+    return next((widths for receipt in _receipts(folder) if (widths := receipt.widths)), None)
+
+
+def check_widths(folder: Path, receipts: Iterable[Receipt]) -> None:
+    """Raises :class:`DataError` where some episodes of a dataset have wider states or actions than others."""
+    first: Receipt | None = None
+    for receipt in receipts:
+        if receipt.widths is None:
+            continue
+        first = first or receipt
+        assert first.widths is not None
+        if problem := first.widths.problem(receipt.widths):
+            raise DataError(
+                f"{folder}: an episode does not fit, {problem} ({receipt.unit} and {first.unit}); a dataset has one "
+                f"width: make those of another one in another --out, and remove {folder}/receipts/{receipt.unit}.json"
+            )
+
+
+def _receipts(folder: Path) -> Iterator[Receipt]:
+    """All receipts of a dataset, as they are found."""
     for path in (folder / "receipts").glob("*.json"):
         if path.name.startswith("."):
             continue
@@ -107,8 +156,7 @@ def read_receipts(folder: Path) -> list[Receipt]:
             raise DataError(f"{path}: field '{field}': {first['msg']}") from error
         if receipt.unit != path.stem:
             raise DataError(f"{path}: field 'unit': is '{receipt.unit}', expected '{path.stem}' as the file is called")
-        receipts.append(receipt)
-    return sorted(receipts, key=lambda r: (r.task, r.seeds))
+        yield receipt
 
 
 def keep_receipt(folder: Path, receipt: Receipt) -> None:

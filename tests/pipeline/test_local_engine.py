@@ -156,3 +156,22 @@ def test_workers_are_single_threaded_and_do_not_outlive_their_parent(tmp_path: P
         parent.kill()
         parent.wait()
     assert wait_for(lambda: not any(alive(pid) for pid, _ in workers), 10), "orphans are left"
+
+
+def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
+    """Workers import what they work with, and not the program that asked for it."""
+    script = tmp_path / "script" / "main.py"
+    script.parent.mkdir()
+    script.write_text(
+        "import sys, pathlib, flowlab\n"
+        "with open(sys.argv[1], 'a') as log:\n"
+        "    log.write('ran ')\n"
+        "few = ['observer.points=64']\n"
+        "dataset = flowlab.extract('drawer-open', sys.argv[2], episodes=1, settings=few, workers=1)\n"
+        "print(len(dataset))\n"
+    )
+    log = tmp_path / "log"
+    done = subprocess.run(
+        [sys.executable, script, log, tmp_path / "data"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stdout, log.read_text()) == (0, "1\n", "ran "), done.stderr[-500:]
