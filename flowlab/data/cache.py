@@ -17,7 +17,7 @@ from flowlab.records import Episode
 
 INDEX = "index.json"
 """Written last: a folder that has it is whole."""
-_FORMAT = 2
+_FORMAT = 3
 _FORM = re.compile(r"[0-9a-f]{16}-\d+(-\w+)?")
 """What folders of decoded arrays are called, of this format and of earlier ones."""
 _MARKS = (INDEX, "corpus.json")

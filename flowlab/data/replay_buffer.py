@@ -118,6 +118,7 @@ def arrays_of(e: Episode) -> tuple[Mapping[str, np.ndarray], Mapping[str, np.nda
         "queries": e.queries.xyz_world,
         "query_role": e.query_role.astype(np.int8),
         "query_count": np.array([e.queries.count]),
+        "estimated": np.array([tracks.quality is not None]),
     }
 
 

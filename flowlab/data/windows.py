@@ -1,5 +1,6 @@
 """Windows of a dataset for anybody's own training loop: a map-style :class:`torch.utils.data.Dataset`."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,12 +14,16 @@ from torch import Tensor
 from flowlab.data.cache import cached_part, open_part
 from flowlab.data.replay_buffer import ARRAYS, arrays_of, pictures_of
 from flowlab.data.source import TrainingSource, open_training_source, source_of
+from flowlab.data.window_arguments import choose_episodes, finite_numbers, one_of, shown
 from flowlab.data.window_stats import describe_rows
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.storage.dataset import Dataset
+from flowlab.storage.episodes import EpisodeSequence
 
 PICTURES = ("rgb", "depth")
-_PER_EPISODE = ("queries", "query_role", "query_count")
+_PER_EPISODE = ("queries", "query_role", "query_count", "estimated")
+_UNKNOWN_IN_IMPORTS = ("success", "time")
+"""What a store in DP3's layout does not tell."""
 
 
 class Windows(torch.utils.data.Dataset[dict[str, Any]]):
@@ -29,8 +34,9 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
     - ``KEY``: a tensor (T, ...) with a row for each of the T offsets of that key, in the dataset's units. Arrays keep
       their type (float32 but for ``visible``, ``success``: bool, ``time``: float64, ``point_count``: int32); ``rgb`` is
       (T, 3, height, width), float32 from 0 to 1, and ``depth`` (T, 1, height, width), z-depth [m], 0 where there is no
-      reading. ``flow`` (T, M, 3) is how far every query point moves until the next row [m], 0 in the last.
+      reading. ``flow`` (T, M, 3) is how far every query point moves until the next row [m].
     - ``KEY_is_pad``: (T,) bool, whether that row lies outside of the episode; then the first or last row is repeated.
+      ``flow_is_pad`` is True in the last row of an episode, too: how points move after it is not known, and 0 there.
     - ``task``: name of the task; ``episode_index`` and ``frame_index``: where the frame is, both from 0.
 
     It can be pickled, and every process maps the files anew, so that it works with the workers of a
@@ -40,11 +46,12 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         loader = torch.utils.data.DataLoader(windows, batch_size=64, shuffle=True, num_workers=2)
 
     Args:
-        data: A dataset, or a store in DP3's layout, opened or by its path.
+        data: A dataset, some of its episodes such as ``dataset.task("push")``, or the path of a dataset or of a store
+            in DP3's layout.
         offsets: For every key that is wanted, its rows relative to the frame: ``[-1, 0]`` is the one before, and its
-            own.
+            own. Each must lie inside of an episode for some frame.
         delta_timestamps: The same in seconds; give either. The rows must be evenly spaced in time.
-        episodes: Which episodes, by their position in order of task and seed; None is all of them.
+        episodes: Which episodes, by their position in ``data``, in order of task and seed; None is all of them.
         tolerance_s: How far a time may be from that of a row [s].
         cache: Folder for the decoded arrays where the dataset's own cannot be written.
 
@@ -55,7 +62,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
 
     def __init__(
         self,
-        data: Dataset | Path | str,
+        data: EpisodeSequence | Path | str,
         offsets: Mapping[str, Sequence[int]] | None = None,
         *,
         delta_timestamps: Mapping[str, Sequence[float]] | None = None,
@@ -63,27 +70,32 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         tolerance_s: float = 1e-4,
         cache: Path | str | None = None,
     ) -> None:
-        source = source_of(data) if isinstance(data, Dataset) else open_training_source(Path(data))
+        asked = one_of(offsets, delta_timestamps)
+        source, among = _opened(data)
         fallback = source.path if cache is None else Path(cache)
         self.path = source.path
         self._statistics = source.statistics["arrays"]
         self._folders = [cached_part(source, fallback, ARRAYS, arrays_of)]
         every, arrays = open_part(self._folders[0])
-        asked = _one_of(offsets, delta_timestamps)
         self._find_pictures(source, fallback, asked)
-        self.keys = self._known(arrays)
+        self.keys = self._known(arrays, source)
         """Names of everything that can be asked for."""
         for key in asked:
             if key not in self.keys:
                 raise UsageError(f"{self.path}: {unknown_name('array', str(key), self.keys)}")
-        self.episodes: tuple[int, ...] = _chosen(episodes, len(every), self.path)
+        self.episodes: tuple[int, ...] = choose_episodes(
+            episodes, range(len(every)) if among is None else among, self.path
+        )
         """Positions of the episodes in the dataset, in order of task and seed."""
         self._episodes = [every[k] for k in self.episodes]
         lengths = [e["stop"] - e["start"] for e in self._episodes]
+        self._longest = max(lengths)
         self.episode_ends: Int[np.ndarray, E] = np.cumsum(lengths)
         """The index after the last of each episode."""
         self.offsets: dict[str, np.ndarray] = {
-            key: _rows(values) if offsets is not None else self._times_to_rows(key, values, source, tolerance_s)
+            key: self._rows(key, values, "iu", "offsets")
+            if offsets is not None
+            else self._times_to_rows(key, values, source, tolerance_s)
             for key, values in asked.items()
         }
         """Rows of every key, relative to the frame."""
@@ -92,6 +104,12 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         return int(self.episode_ends[-1])
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        if not hasattr(index, "__index__"):
+            raise UsageError(
+                f"{self.path}: windows are numbered, as in windows[2], and found windows[{shown(index)}]; several are "
+                "torch.utils.data.Subset(windows, range(2, 4))"
+            )
+        index = operator.index(index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: there are {len(self)} windows, and no window {index}")
         index = index % len(self)
@@ -103,7 +121,8 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
             wanted = episode["start"] + frame + offsets
             rows = np.clip(wanted, episode["start"], episode["stop"] - 1)
             item[key] = self._read(key, rows, episode["stop"] - 1)
-            item[f"{key}_is_pad"] = torch.from_numpy(wanted != rows)
+            unknown = (wanted == episode["stop"] - 1) & (key == "flow")
+            item[f"{key}_is_pad"] = torch.from_numpy((wanted != rows) | unknown)
         return item
 
     def __repr__(self) -> str:
@@ -151,11 +170,13 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
             if name in asked:
                 self._folders.append(cached_part(source, fallback, name, partial(pictures_of, name=name)))
 
-    def _known(self, arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    def _known(self, arrays: Mapping[str, np.ndarray], source: TrainingSource) -> tuple[str, ...]:
         """What can be asked for: arrays that are not empty, flow where there are tracks, and pictures that were
         found."""
         names = {n for n, a in arrays.items() if n not in _PER_EPISODE and 0 not in a.shape[1:]}
+        names -= {"sigma"} if not arrays["estimated"].any() else set()
         names |= {"flow"} if "tracks" in names else set()
+        names -= set(_UNKNOWN_IN_IMPORTS) if source.provenance.kind == "imported" else set()
         for folder in self._folders[1:]:
             names |= set(open_part(folder)[1])
         return tuple(sorted(names))
@@ -163,15 +184,29 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
     def _times_to_rows(
         self, key: str, times: Sequence[float], source: TrainingSource, tolerance_s: float
     ) -> Int[np.ndarray, "T"]:
+        if not (isinstance(tolerance_s, int | float) and 0 <= tolerance_s < np.inf):
+            raise UsageError(f"Windows: tolerance_s must be seconds, 0 or more, as in 0.0001; found {tolerance_s!r}")
         step = self._step_s(source, tolerance_s)
-        rows = np.round(np.asarray(times, float) / step).astype(int)
-        for time, row in zip(times, rows, strict=True):
+        seconds = finite_numbers(key, times, "iuf", "delta_timestamps")
+        rows = self._rows(key, np.round(seconds / step), "f", "delta_timestamps")
+        for time, row in zip(seconds, rows, strict=True):
             if abs(time - row * step) > tolerance_s:
                 raise UsageError(
                     f"{self.path}: delta_timestamps of '{key}': {time:g} s is that of no row; the rows are {step:g} s "
                     f"apart, so the nearest is {row * step:g} s"
                 )
         return rows
+
+    def _rows(self, key: str, offsets: Any, kinds: str, what: str) -> Int[np.ndarray, "T"]:
+        """Rows that lie inside of some episode for some frame."""
+        rows = finite_numbers(key, offsets, kinds, what)
+        outside = rows[(rows <= -self._longest) | (rows >= self._longest)]
+        if len(outside):
+            raise UsageError(
+                f"{self.path}: {what} of '{key}': {outside[0]:.0f} rows off lies outside of every episode; the longest "
+                f"has {self._longest} rows, so rows are {1 - self._longest} to {self._longest - 1} off"
+            )
+        return rows.astype(int)
 
     def _step_s(self, source: TrainingSource, tolerance_s: float) -> float:
         """Time from row to row [s]."""
@@ -188,30 +223,14 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         return step
 
 
-def _one_of(
-    offsets: Mapping[str, Sequence[int]] | None, delta_timestamps: Mapping[str, Sequence[float]] | None
-) -> Mapping[str, Sequence[Any]]:
-    if (offsets is None) == (delta_timestamps is None):
-        raise UsageError(
-            "Windows: give either offsets or delta_timestamps, as in {'state': [-1, 0], 'action': range(8)}"
-        )
-    asked = offsets if offsets is not None else delta_timestamps
-    assert asked is not None
-    return asked
-
-
-def _rows(offsets: Sequence[int]) -> Int[np.ndarray, "T"]:
-    rows = np.asarray(offsets)
-    if rows.ndim != 1 or not len(rows) or rows.dtype.kind not in "iu":
-        raise UsageError(f"Windows: offsets must be whole numbers of rows, as in [-1, 0]; found {offsets!r}")
-    return rows.astype(int)
-
-
-def _chosen(episodes: Sequence[int] | None, count: int, path: Path) -> tuple[int, ...]:
-    chosen = tuple(range(count)) if episodes is None else tuple(episodes)
-    for k in chosen:
-        if not 0 <= k < count:
-            raise UsageError(f"{path}: no episode {k}; there are {count}, counted from 0")
-    if not chosen:
-        raise UsageError(f"{path}: episodes is empty; leave it out for all {count} of them")
-    return chosen
+def _opened(data: EpisodeSequence | Path | str) -> tuple[TrainingSource, list[int] | None]:
+    """What is read, and the positions in it of the episodes that were given; None is all of them."""
+    if isinstance(data, Dataset):
+        return source_of(data), None
+    if isinstance(data, EpisodeSequence):
+        dataset = Dataset(data.path)
+        position = {ref: k for k, ref in enumerate(dataset.refs)}
+        return source_of(dataset), [position[ref] for ref in data.refs]
+    if not isinstance(data, str | Path):
+        raise UsageError(f"Windows: data must be a dataset or its path, as in 'data/push'; found {shown(data)}")
+    return open_training_source(Path(data)), None

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from types import ModuleType
 from typing import Any, Self
@@ -46,6 +47,20 @@ def _main_hidden() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
+@contextmanager
+def _current_folder_hidden() -> Iterator[None]:
+    """Python started anew would look for modules in the current folder first, whatever lies there."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
+
+
 class _Worker(ForkServerProcess):
     """A process that imports what it works with, and never the script that asked for it."""
 
@@ -58,7 +73,7 @@ class _Worker(ForkServerProcess):
 class _OwnProgramContext(ForkServerContext):
     """Starts such workers: a script needs no ``if __name__ == "__main__"``."""
 
-    Process = _Worker  # type: ignore[assignment]
+    Process = _Worker
 
 
 class LocalEngine(Engine[Unit, Receipt]):
@@ -77,6 +92,8 @@ class LocalEngine(Engine[Unit, Receipt]):
         # Workers are forked from a clean process that has imported everything once, and share its memory.
         context = _OwnProgramContext()
         context.set_forkserver_preload([*self.imports])
+        with _current_folder_hidden():
+            forkserver.ensure_running()
         self._pool = ProcessPool(
             max_workers=self.workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )

@@ -7,9 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from jaxtyping import Bool, Float, Float32, Int8, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int8, UInt8
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, UsageError
 from flowlab.files import new_folder
 from flowlab.geometry.camera import Camera
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics
@@ -18,7 +18,7 @@ _MAX_COUNT = np.iinfo(np.uint16).max
 
 
 def write_rgbd_recording(
-    folder: Path,
+    folder: Path | str,
     *,
     rgb: Iterable[UInt8[np.ndarray, "H W 3"]],
     depth: Iterable[Float[np.ndarray, "H W"]],
@@ -38,11 +38,12 @@ def write_rgbd_recording(
 
     Args:
         folder: Where to; it must not exist.
-        rgb: The color pictures, taken one by one.
-        depth: As many depth pictures [m], seen from the same camera; 0 or not finite where there is no reading.
+        rgb: The color pictures, uint8 from 0 to 255, taken one by one.
+        depth: As many depth pictures [m] of floating point, seen from the same camera; 0 or not finite where there is
+            no reading.
         camera: Its size is that of all pictures.
-        time_s: When each was taken [s].
-        state: What the robot was at each.
+        time_s: When each was taken [s], one after the other.
+        state: What the robot was at each; every row finite.
         action: What it then did.
         success: Whether the demonstration solved its task.
         task: What the robot does.
@@ -53,26 +54,86 @@ def write_rgbd_recording(
         role: The :class:`~flowlab.records.Role` of what they lie on.
 
     Raises:
+        UsageError: Pictures, times, state or action are of another type or shape, or ``depth_unit_m`` is not above 0.
         DataError: The folder exists or cannot be written, lengths or sizes differ, or a reading does not fit 16 bits.
     """
+    folder = Path(folder)
+    time_s = _times(time_s)
+    if not (isinstance(depth_unit_m, int | float | np.number) and 0 < depth_unit_m < np.inf):
+        raise UsageError(f"depth_unit_m is {depth_unit_m!r}, expected meters above 0, as in 0.001")
+    if not isinstance(camera, Camera):
+        raise UsageError(f"camera is {type(camera).__name__}, expected a flowlab.Camera")
     if folder.exists():
         raise DataError(f"{folder}: exists already; delete it, or write the recording elsewhere")
     truth = {"query_px": query_px, "tracks_cam": tracks_cam, "visible": visible, "role": role}
-    samples = {name: values for name, values in {"state": state, "action": action}.items() if values is not None}
+    given = {"state": state, "action": action}
+    samples = {name: _rows(name, values, len(time_s)) for name, values in given.items() if values is not None}
     known: dict[str, Any] = {name: values for name, values in truth.items() if values is not None}
     try:
         with new_folder(folder) as temporary:
             _write_pictures(folder, temporary, rgb, depth, camera, len(time_s), depth_unit_m)
-            (temporary / "times.txt").write_text("".join(f"{t!r}\n" for t in np.asarray(time_s, float).tolist()))
+            (temporary / "times.txt").write_text("".join(f"{t!r}\n" for t in time_s.tolist()))
             for name, values in samples.items():
-                if len(values) != len(time_s):
-                    raise DataError(f"{folder}: {len(values)} rows of {name} for {len(time_s)} frames")
-                np.save(temporary / f"{name}.npy", np.asarray(values, np.float32))
-            (temporary / FILE_NAME).write_text(_yaml(camera, list(samples), depth_unit_m, success, task))
+                np.save(temporary / f"{name}.npy", values)
+            (temporary / FILE_NAME).write_text(_yaml(camera, list(samples), float(depth_unit_m), success, task))
             if query_px is not None:
                 np.savez_compressed(temporary / "ground_truth.npz", **known)
     except OSError as error:
         raise DataError(f"{folder}: the recording cannot be written ({error.strerror or error})") from error
+
+
+def _times(time_s: Any) -> Float64[np.ndarray, "T"]:
+    """Times [s] that rise."""
+    found = _numbers("time_s", time_s)
+    if found.ndim != 1 or not len(found):
+        raise UsageError(f"time_s has the shape {found.shape}, expected (T,), seconds for each of T frames")
+    falls = np.flatnonzero(np.diff(found) <= 0)
+    if len(falls):
+        t = falls[0]
+        raise UsageError(
+            f"time_s goes from {found[t]:g} to {found[t + 1]:g} s at frame {t + 1}, expected times that rise"
+        )
+    return found
+
+
+def _rows(name: str, values: Any, steps: int) -> Float32[np.ndarray, "T S"]:
+    """State or action, a row for every frame."""
+    found = _numbers(name, values)
+    if found.ndim != 2 or len(found) != steps:
+        raise UsageError(
+            f"{name} has the shape {found.shape}, expected ({steps}, width), a row for each of {steps} frames"
+        )
+    return found.astype(np.float32)
+
+
+def _numbers(name: str, values: Any) -> Float64[np.ndarray, "..."]:
+    """Finite numbers."""
+    try:
+        found = np.asarray(values)
+    except ValueError as error:
+        raise UsageError(f"{name} has rows of different lengths, expected an array") from error
+    if found.dtype.kind not in "iuf":
+        raise UsageError(f"{name} is {found.dtype}, expected numbers")
+    wrong = np.argwhere(~np.isfinite(found))
+    if len(wrong):
+        where = ", ".join(map(str, wrong[0]))
+        raise UsageError(f"{name}[{where}] is {found[tuple(wrong[0])]}, expected a finite number")
+    return found.astype(np.float64)
+
+
+def _check_types(t: int, rgb: Any, depth: Any) -> None:
+    """Refuse pictures whose numbers would be taken for others."""
+    for name, picture in (("rgb", rgb), ("depth", depth)):
+        if not isinstance(picture, np.ndarray):
+            raise UsageError(f"{name} of frame {t} is {type(picture).__name__}, expected a NumPy array")
+    if rgb.dtype != np.uint8:
+        how = "; of floats from 0 to 1 give (rgb * 255).round().astype(np.uint8)" if rgb.dtype.kind == "f" else ""
+        raise UsageError(f"rgb of frame {t} is {rgb.dtype}, expected uint8 from 0 to 255{how}")
+    if depth.dtype.kind != "f":
+        raise UsageError(
+            f"depth of frame {t} is {depth.dtype}, expected meters as float32; of millimeters give "
+            "(depth / 1000).astype(np.float32)"
+        )
 
 
 def _write_pictures(
@@ -90,6 +151,7 @@ def _write_pictures(
         (into / name).mkdir()
     try:
         for t, (picture, meters) in enumerate(zip(rgb, depth, strict=True)):
+            _check_types(t, picture, meters)
             if picture.shape != (*size, 3) or meters.shape != size:
                 raise DataError(f"{folder}: frame {t} is {picture.shape} and {meters.shape}, the camera's is {size}")
             _write_png(into / "color" / f"{t:06d}.png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -1,13 +1,14 @@
 """Episodes of a dataset as a sequence: all of them, some of them, those of one task."""
 
+import operator
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
-from flowlab.errors import DataError, unknown_name
+from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
 from flowlab.storage.shard import Shard
 
@@ -52,10 +53,12 @@ class EpisodeSequence(Sequence[Episode], ABC):
 
         Raises:
             IndexError: There is no such episode.
+            UsageError: The index is no number and no slice.
             DataError: Its shard is missing or damaged.
         """
         if isinstance(index, slice):
             return DatasetView(self.path, self.refs[index])
+        index = self._position(index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
         ref = self.refs[index]
@@ -68,6 +71,41 @@ class EpisodeSequence(Sequence[Episode], ABC):
             if shard is None or ref.shard != name:
                 name, shard = ref.shard, Shard(self.path / ref.shard)
             yield shard.episode(ref.position)
+
+    def __contains__(self, episode: object) -> bool:
+        """Whether an episode of the same task and seed is here. Raises :class:`UsageError` for what is no episode."""
+        return self.count(episode) > 0
+
+    def count(self, value: object) -> int:
+        """How many episodes are of the same task and seed as one. Raises :class:`UsageError` as ``in`` does."""
+        task, seed = self._identity(value)
+        return sum((ref.task, ref.seed) == (task, seed) for ref in self.refs)
+
+    def index(self, value: object, start: int = 0, stop: int | None = None) -> int:
+        """The position of the episode of the same task and seed, from 0.
+
+        Raises:
+            ValueError: There is none, as for a list.
+            UsageError: The value is no episode.
+        """
+        task, seed = self._identity(value)
+        for k in range(*slice(start, stop).indices(len(self))):
+            if (self.refs[k].task, self.refs[k].seed) == (task, seed):
+                return k
+        raise ValueError(f"{self.path}: no episode of {task} has the seed {seed}")
+
+    def _position(self, index: Any) -> int:
+        """An index as a number, which NumPy's are, too."""
+        if hasattr(index, "__index__"):
+            return operator.index(index)
+        how = f"episodes of one task are dataset.task({index!r})" if isinstance(index, str) else "as in dataset[2]"
+        raise UsageError(f"{self.path}: episodes are numbered, and found a {type(index).__name__}; {how}")
+
+    def _identity(self, value: object) -> tuple[str, int]:
+        """What tells an episode from all others of a dataset."""
+        if not isinstance(value, Episode):
+            raise UsageError(f"{self.path}: holds episodes, and found a {type(value).__name__}; tasks are in .tasks")
+        return value.task, value.seed
 
     @property
     def tasks(self) -> tuple[str, ...]:

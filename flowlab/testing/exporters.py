@@ -58,7 +58,13 @@ def check_written(make: MakeExporter, dataset: Dataset) -> None:
     """It writes where it is told and nowhere else, and says how many episodes these are."""
     before = content(dataset.path)
     with _place() as folder:
-        count = make().export(dataset, folder / "deeper" / "out")
+        try:
+            count = make().export(dataset, folder / "deeper" / "out")
+        except OSError as error:
+            raise AssertionError(
+                f"export() must make the folders that lead to where it writes, but raises {error!r}; call "
+                "path.parent.mkdir(parents=True, exist_ok=True), or write into flowlab.files.new_folder(path)"
+            ) from error
         require(count == len(dataset), f"export() must return {len(dataset)}, how many it wrote, but returns {count!r}")
         found = sorted(p.name for p in (folder / "deeper").iterdir())
         require(found == ["out"], f"export() must leave 'out', as it was told, and nothing beside; it leaves {found}")

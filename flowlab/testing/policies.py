@@ -38,7 +38,10 @@ def check_policy(policy: Policy, settings: Sequence[str] = ()) -> None:
 
 def check_settings(policy: Policy, settings: Sequence[str] = ()) -> None:
     """It has a title; every setting has a default; settings say what it needs, and survive JSON."""
-    _require(isinstance(getattr(policy, "title", None), str), "title must be what people call the policy")
+    known = isinstance(policy, type) and issubclass(policy, PolicyNetwork)
+    _require(known, f"a policy must be a class of flowlab.policies.base.PolicyNetwork, and {policy!r} is none")
+    title = getattr(policy, "title", None)
+    _require(isinstance(title, str) and title.strip(), f"title must be what people call the policy, but is {title!r}")
     model: Any = getattr(policy, "settings_class", None)
     _require(isinstance(model, type) and issubclass(model, TrainSettings), "settings_class must be of TrainSettings")
     missing = next(_without_default(model), None)

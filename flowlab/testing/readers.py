@@ -13,6 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,20 @@ _DAMAGED_FILES = 12
 """So many files of a recording are damaged, one at a time, evenly chosen."""
 
 
-def check_reader(make: MakeReader, recording: Path) -> None:
+Check = Callable[[MakeReader, Path | str], None]
+
+
+def _promise(check: Callable[[MakeReader, Path], None]) -> Check:
+    """A check that takes the path as text, too."""
+
+    @wraps(check)
+    def checked(make: MakeReader, recording: Path | str) -> None:
+        check(make, Path(recording))
+
+    return checked
+
+
+def check_reader(make: MakeReader, recording: Path | str) -> None:
     """Raise an AssertionError that says which promise a reader breaks.
 
     Args:
@@ -42,6 +56,7 @@ def check_reader(make: MakeReader, recording: Path) -> None:
         check(make, recording)
 
 
+@_promise
 def check_description(make: MakeReader, recording: Path) -> None:
     """It is made without arguments, and says what it is called and what it reads."""
     reader = make()
@@ -49,6 +64,7 @@ def check_description(make: MakeReader, recording: Path) -> None:
     require(isinstance(reader.fallback, bool), f"fallback must be True or False, but is {reader.fallback!r}")
 
 
+@_promise
 def check_recognized(make: MakeReader, recording: Path) -> None:
     """It recognizes its own layout, and no other reader claims that."""
     require(make().probe(recording), f"probe() must recognize {recording.name}, a recording of its layout")
@@ -60,6 +76,7 @@ def check_recognized(make: MakeReader, recording: Path) -> None:
     )
 
 
+@_promise
 def check_strangers(make: MakeReader, recording: Path) -> None:
     """It leaves other files and folders alone, whatever they are."""
     reader = make()
@@ -75,6 +92,7 @@ def check_strangers(make: MakeReader, recording: Path) -> None:
             require(own or not claimed, f"probe() must not recognize '{stranger.name}', which is something else")
 
 
+@_promise
 def check_streams(make: MakeReader, recording: Path) -> None:
     """Streams have times, in order, and as many names or rows."""
     streams = _read(make(), recording)
@@ -88,6 +106,7 @@ def check_streams(make: MakeReader, recording: Path) -> None:
     require(all(isinstance(n, str) and n for n in streams.notes), "notes must be sentences")
 
 
+@_promise
 def check_pictures(make: MakeReader, recording: Path) -> None:
     """Every picture is decoded, in any order, the same each time, and belongs to whoever asked for it."""
     streams = _read(make(), recording)
@@ -104,6 +123,7 @@ def check_pictures(make: MakeReader, recording: Path) -> None:
         require(not rewritten, f"{what} pictures must not change where somebody writes into those that were given out")
 
 
+@_promise
 def check_repeatable(make: MakeReader, recording: Path) -> None:
     """Reading a recording again gives the same streams."""
     one, other = _read(make(), recording), _read(make(), recording)
@@ -113,6 +133,7 @@ def check_repeatable(make: MakeReader, recording: Path) -> None:
         require(np.array_equal(c.values, d.values), "read() must find the same samples again")
 
 
+@_promise
 def check_nothing_written(make: MakeReader, recording: Path) -> None:
     """Nothing is written, moved or deleted: not in the recording, not beside it, not in the current folder."""
     with _place() as folder, _place() as current:
@@ -129,6 +150,7 @@ def check_nothing_written(make: MakeReader, recording: Path) -> None:
         require(not any(current.iterdir()), "a reader must not write into the current folder")
 
 
+@_promise
 def check_damaged(make: MakeReader, recording: Path) -> None:
     """What is damaged is noticed: a bad picture is a BadImage, all else one sentence, never another error."""
     files = [f for f in sorted(recording.rglob("*")) if f.is_file()] if recording.is_dir() else [recording]
@@ -143,6 +165,7 @@ def check_damaged(make: MakeReader, recording: Path) -> None:
                 require(not unseen, f"{damaged.name}, {how}, must be a BadImage, but is read as if it were whole")
 
 
+@_promise
 def check_missing(make: MakeReader, recording: Path) -> None:
     """A recording that is gone is one sentence."""
     with _place() as folder:
@@ -151,7 +174,7 @@ def check_missing(make: MakeReader, recording: Path) -> None:
         _complaint(make, gone, "a recording that is not there")
 
 
-CHECKS: tuple[Callable[[MakeReader, Path], None], ...] = (
+CHECKS: tuple[Check, ...] = (
     check_description,
     check_recognized,
     check_strangers,

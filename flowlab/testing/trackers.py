@@ -91,6 +91,7 @@ def check_tracker(make: MakeTracker) -> None:
 def check_description(make: MakeTracker) -> None:
     """It has a name and a license, and describes itself in JSON."""
     tracker = make()
+    require(isinstance(tracker, Tracker), f"it must be a Tracker, but is a {type(tracker).__name__}")
     require_words(tracker, "name", "license")
     try:
         json.dumps(tracker.describe())

@@ -77,6 +77,8 @@ KEYS = ("point_cloud", "point_count", "state", "action", "success", "time", "tra
 def test_a_window_is_what_its_episode_says(
     data: Path, episodes: list[Episode], offsets: dict[str, list[int]], chosen: list[int], where: float
 ) -> None:
+    longest = max(len(episodes[k]) for k in chosen)
+    offsets = {key: [r % longest if abs(r) >= longest else r for r in rows] for key, rows in offsets.items()}
     windows = Windows(data, offsets, episodes=chosen)
     assert len(windows) == sum(len(episodes[k]) for k in chosen)
     index = int(where * len(windows))
@@ -90,7 +92,8 @@ def test_a_window_is_what_its_episode_says(
         wanted = np.stack([row_of(e, key, frame + r) for r in rows])
         assert item[key].dtype == torch.from_numpy(wanted).dtype, key
         np.testing.assert_array_equal(item[key].numpy(), wanted, err_msg=key)
-        assert item[f"{key}_is_pad"].tolist() == [not 0 <= frame + r < len(e) for r in rows]
+        known = len(e) - (key == "flow")  # nothing is known of how points move after the last row
+        assert item[f"{key}_is_pad"].tolist() == [not 0 <= frame + r < known for r in rows]
 
 
 def test_windows_are_numbered_from_either_end(data: Path) -> None:
@@ -163,8 +166,7 @@ def test_a_store_of_dp3_does_not_tell_times(data: Path, tmp_path: Path, episodes
     DP3Exporter().export(Dataset(data), tmp_path / "s.zarr", "roll")
     windows = Windows(tmp_path / "s.zarr", {"point_cloud": [0], "action": [0, 1]})
     assert len(windows) == sum(LENGTHS)
-    assert "tracks" not in windows.keys
-    assert "flow" not in windows.keys
+    assert set(windows.keys) == {"point_cloud", "point_count", "state", "action"}
     with pytest.raises(DataError, match="does not tell how far its rows are apart in time; give offsets in rows"):
         Windows(tmp_path / "s.zarr", delta_timestamps={"action": [0.0]})
 
@@ -196,10 +198,25 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "key": ({"offsets": {"pointcloud": [0]}}, "no array is called 'pointcloud'; did you mean point_cloud"),
     "neither": ({}, "give either offsets or delta_timestamps"),
     "both": ({"offsets": {}, "delta_timestamps": {}}, "give either offsets or delta_timestamps"),
-    "fraction": ({"offsets": {"state": [0.5]}}, r"offsets must be whole numbers of rows, as in .*; found \[0.5\]"),
-    "number": ({"offsets": {"state": 0}}, "offsets must be whole numbers of rows"),
+    "nothing": ({"offsets": {}}, r"offsets must say which rows are wanted of every key, as in \{'state'.*; found \{\}"),
+    "no times": ({"delta_timestamps": {}}, "delta_timestamps must say which rows are wanted of every key"),
+    "keys only": ({"offsets": ["action"]}, r"must say which rows are wanted of every key, .*; found \['action'\]"),
+    "fraction": ({"offsets": {"state": [0.5]}}, r"'state' must be whole numbers of rows, as in .*; found \[0.5\]"),
+    "number": ({"offsets": {"state": 0}}, "offsets of 'state' must be whole numbers of rows"),
+    "ragged": ({"offsets": {"state": [[0], [0, 1]]}}, "offsets of 'state' must be whole numbers of rows"),
+    "far ahead": ({"offsets": {"state": [0, 14]}}, "14 rows off lies outside of every episode; the longest has 14"),
+    "far behind": ({"offsets": {"state": [-500]}}, "-500 rows off lies outside of every episode; .* are -13 to 13 off"),
+    "late": ({"delta_timestamps": {"state": [1e300]}}, "delta_timestamps of 'state': .* outside of every episode"),
+    "nan": ({"delta_timestamps": {"state": [np.nan]}}, r"'state' must be finite seconds, as in .*; found \[nan\]"),
+    "endless": ({"delta_timestamps": {"state": [-np.inf]}}, "'state' must be finite seconds"),
+    "words": ({"delta_timestamps": {"state": ["a"]}}, r"must be finite seconds, as in .*; found \['a'\]"),
+    "tolerance": ({"delta_timestamps": {"state": [0]}, "tolerance_s": np.nan}, "tolerance_s must be seconds, 0"),
     "episode": ({"offsets": {"state": [0]}, "episodes": [4]}, "no episode 4; there are 4, counted from 0"),
     "no episode": ({"offsets": {"state": [0]}, "episodes": []}, "episodes is empty; leave it out for all 4 of them"),
+    "task": ({"offsets": {"state": [0]}, "episodes": ["push"]}, r"must be positions of episodes.*found \['push'\]"),
+    "task's name": ({"offsets": {"state": [0]}, "episodes": "push"}, "must be positions of episodes.*found 'push'"),
+    "one episode": ({"offsets": {"state": [0]}, "episodes": 2}, "must be positions of episodes.*found 2"),
+    "mask": ({"offsets": {"state": [0]}, "episodes": [True, False]}, "must be positions of episodes.*found .True"),
 }  # fmt: skip
 
 
@@ -214,3 +231,45 @@ def test_pictures_that_are_not_there_are_no_key(tmp_path: Path) -> None:
     make_dataset(tmp_path / "d", [[make_episode(0)]])
     with pytest.raises(UsageError, match="no array is called 'rgb'"):
         Windows(tmp_path / "d", {"rgb": [0]})
+
+
+@pytest.mark.parametrize("index", [slice(2, 4), "a", 1.5, [0, 1], None])
+def test_an_index_that_is_no_number_is_one_sentence(index: Any, data: Path) -> None:
+    with pytest.raises(UsageError, match=r"windows are numbered, as in windows\[2\], and found .*Subset"):
+        Windows(data, {"state": [0]})[index]
+
+
+def test_numbers_of_numpy_and_torch_are_indices(data: Path) -> None:
+    windows = Windows(data, {"state": [0]})
+    for index in (np.int64(3), torch.tensor(3)):
+        assert windows[index]["frame_index"] == 3  # type: ignore[index]
+
+
+def test_the_flow_of_the_last_row_is_not_known(data: Path, episodes: list[Episode]) -> None:
+    windows = Windows(data, {"flow": range(-1, 3), "tracks": range(-1, 3)}, episodes=[1])
+    last = len(episodes[1]) - 1
+    assert windows[last]["flow_is_pad"].tolist() == [False, True, True, True]
+    assert windows[last]["tracks_is_pad"].tolist() == [False, False, True, True]
+
+
+def test_exact_tracks_state_no_error(tmp_path: Path, data: Path) -> None:
+    make_dataset(tmp_path / "d", [[make_episode(0)]])
+    assert "sigma" not in Windows(tmp_path / "d", {"state": [0]}).keys
+    with pytest.raises(UsageError, match="no array is called 'sigma'"):
+        Windows(tmp_path / "d", {"sigma": [0]})
+    assert "sigma" in Windows(data, {"state": [0]}).keys
+
+
+def test_windows_of_one_task(data: Path, episodes: list[Episode]) -> None:
+    view = Dataset(data).task("roll")
+    windows = Windows(view, {"state": [0]}, episodes=[2, 0])
+    assert windows.tasks == ("roll",)
+    assert len(windows) == len(view[2]) + len(view[0])
+    np.testing.assert_array_equal(windows[0]["state"][0], view[2].state[0])
+    np.testing.assert_array_equal(episodes[windows.episodes[1]].state, view[0].state)
+    with pytest.raises(UsageError, match="no episode 3; there are 3"):
+        Windows(view, {"state": [0]}, episodes=[3])
+    with pytest.raises(UsageError, match="expected one or more"):
+        Windows(view[:0], {"state": [0]})
+    with pytest.raises(UsageError, match=r"data must be a dataset or its path, .*found 5"):
+        Windows(5, {"state": [0]})  # type: ignore[arg-type]

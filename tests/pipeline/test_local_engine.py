@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import flowlab
 from flowlab.engines.base import UnitResult
 from flowlab.engines.local import LocalEngine
 from flowlab.errors import DataError
@@ -175,3 +176,19 @@ def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
         [sys.executable, script, log, tmp_path / "data"], capture_output=True, text=True, timeout=120, check=False
     )
     assert (done.returncode, done.stdout, log.read_text()) == (0, "1\n", "ran "), done.stderr[-500:]
+
+
+def test_nothing_in_the_current_folder_is_run(tmp_path: Path) -> None:
+    """Somebody works in a folder of downloaded files; the console script does not look there, nor do its workers."""
+    for name in ("json", "yaml", "numpy", "queue"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})\n")
+    script = tmp_path / "bin" / "flowlab"
+    script.parent.mkdir()
+    script.write_text("import sys\nfrom flowlab.cli import main\nmain()\n")
+    arguments = ["extract-sim", "reach", "--episodes", "1", "--workers", "1", "--out", tmp_path / "data"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(flowlab.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, script, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "ran").exists(), (tmp_path / "ran").read_text()

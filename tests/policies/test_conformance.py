@@ -92,6 +92,10 @@ class NoTitle(Plain):
     title = None  # type: ignore[assignment]
 
 
+class EmptyTitle(Plain):
+    title = ""
+
+
 class RequiredSettings(PlainSettings):
     depth_width: int
 
@@ -165,6 +169,12 @@ class Greedy(Plain):
 
 BROKEN: Mapping[str, tuple[Any, str]] = {
     "no title": (NoTitle, "title must be what people call the policy"),
+    "an empty title": (EmptyTitle, "title must be what people call the policy, but is ''"),
+    "no network": (
+        PlainSettings,
+        "a policy must be a class of flowlab.policies.base.PolicyNetwork, and <class .* is none",
+    ),
+    "no class": (Needs(), "a policy must be a class of flowlab.policies.base.PolicyNetwork"),
     "a setting without a default": (Required, "every setting must have a default, and depth_width has none"),
     "noise of its own": (OwnNoise, "draw noise from what compute_loss is given only"),
     "a sum over windows": (Summed, "the mean of the losses of two halves"),

@@ -24,7 +24,7 @@ from real_recordings import (
 )
 from thoroughness import examples
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, FlowlabError
 from flowlab.geometry.camera import Camera
 from flowlab.recordings.readers.plain import write_rgbd_recording
 from flowlab.recordings.recording import RecordingSettings, describe, find_recordings
@@ -108,14 +108,37 @@ def test_true_tracks_lie_beside(tmp_path: Path) -> None:
         ({"depth": meters() * 100}, "frame 0 reads .* 16 bits of 0.001 m hold 65.53 m; use a greater depth_unit_m"),
         ({"depth": meters()[:-1]}, "not as many depth as color"),
         ({"time_s": TIMES[:-1]}, "6 frames for 5 times"),
-        ({"state": np.zeros((4, 2))}, "4 rows of state for 6 frames"),
+        ({"state": np.zeros((4, 2))}, r"state has the shape \(4, 2\), expected \(6, width\), a row for each of 6"),
+        ({"state": np.zeros(STEPS)}, r"state has the shape \(6,\), expected \(6, width\)"),
+        ({"action": np.full((STEPS, 2), np.nan)}, r"action\[0, 0\] is nan, expected a finite number"),
+        ({"action": [[1], [1, 2]]}, "action has rows of different lengths"),
+        ({"rgb": colors() / np.float32(255)}, r"rgb of frame 0 is float32, expected uint8 .* \(rgb \* 255\).round"),
+        ({"rgb": colors().astype(np.int64)}, "rgb of frame 0 is int64, expected uint8 from 0 to 255$"),
+        ({"rgb": colors()[..., 0]}, r"frame 0 is \(24, 32\) and"),
+        (
+            {"depth": counts()},
+            r"depth of frame 0 is uint16, expected meters as float32; of millimeters give \(depth / ",
+        ),
+        ({"depth": [[1.0]] * STEPS}, "depth of frame 0 is list, expected a NumPy array"),
+        ({"time_s": TIMES[::-1]}, "time_s goes from 0.2 to 0.13.* s at frame 1, expected times that rise"),
+        ({"time_s": 0 * TIMES}, "expected times that rise"),
+        ({"time_s": np.where(TIMES > 0.1, np.inf, TIMES)}, r"time_s\[4\] is inf, expected a finite number"),
+        ({"time_s": "now"}, "time_s is <U3, expected numbers"),
+        ({"depth_unit_m": 0}, "depth_unit_m is 0, expected meters above 0, as in 0.001"),
+        ({"depth_unit_m": np.nan}, "depth_unit_m is nan, expected meters above 0"),
+        ({"camera": K}, "camera is ndarray, expected a flowlab.Camera"),
         ({"rgb": colors(size=(16, 24))}, r"frame 0 is \(24, 16, 3\) and \(24, 32\), the camera's is \(24, 32\)"),
     ],
 )
 def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(FlowlabError, match=message):
         write(tmp_path / "r", **changes)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    write_rgbd_recording(str(tmp_path / "r"), rgb=colors(), depth=meters(), camera=CAMERA, time_s=TIMES)
+    assert_frames(opened(tmp_path / "r"), list(range(STEPS)))
 
 
 def test_a_writer_that_dies_leaves_nothing_that_counts(tmp_path: Path) -> None:

@@ -136,6 +136,11 @@ def test_what_breaks_nothing_passes(box: Path) -> None:
     check_reader(Boxes, box)
 
 
+def test_a_path_may_be_text(box: Path) -> None:
+    for check in CHECKS:
+        check(Boxes, str(box))
+
+
 def changed(**attributes: Any) -> type[Reader]:
     return type("Changed", (Boxes,), attributes)
 

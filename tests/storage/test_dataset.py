@@ -59,6 +59,31 @@ def test_a_dataset_is_a_sequence_of_its_episodes(tmp_path: Path) -> None:
             dataset[index]
 
 
+def test_an_episode_is_known_by_its_task_and_seed(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path, [EPISODES[:3], EPISODES[3:]])
+    roll = dataset.task("roll")
+    assert EPISODES[1] in roll
+    assert dataset[4] in dataset
+    assert dataset[1] not in roll
+    assert dataset.index(EPISODES[1]) == 4
+    assert roll.index(EPISODES[1]) == 1
+    assert roll.count(EPISODES[1]) == 1
+    with pytest.raises(ValueError, match="no episode of push has the seed 0"):
+        roll.index(EPISODES[3])
+    with pytest.raises(ValueError, match="no episode of roll has the seed 1"):
+        roll.index(EPISODES[1], 2)
+    with pytest.raises(UsageError, match=r"holds episodes, and found a str; tasks are in \.tasks"):
+        _ = "push" in dataset
+
+
+def test_an_index_that_is_no_number_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path, [EPISODES])
+    with pytest.raises(UsageError, match=r"found a str; episodes of one task are dataset\.task\('push'\)"):
+        dataset["push"]  # type: ignore[call-overload]
+    with pytest.raises(UsageError, match=r"episodes are numbered, and found a list; as in dataset\[2\]"):
+        dataset[[0, 1]]  # type: ignore[call-overload]
+
+
 def test_part_of_a_dataset_is_one_too(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path, [EPISODES[:3], EPISODES[3:]])
     assert dataset.tasks == ("push", "roll")

@@ -172,11 +172,20 @@ class AnyTask(Lengths):
         return super().export(dataset, path, task)
 
 
+class Homeless(Lengths):
+    """Leaves it to others to make the folder that it writes into."""
+
+    def export(self, dataset: Dataset, path: Path, task: str | None = None) -> int:
+        path.mkdir()
+        return super().export(dataset, path, task)
+
+
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
         (Nameless, "name must be some words, but is ''"),
         (Miscounted, r"export\(\) must return 4, how many it wrote, but returns 5"),
+        (Homeless, r"must make the folders that lead to where it writes, but raises FileNotFoundError.*mkdir\(parents"),
         (AllTasks, "must write the episodes of the task that it is asked for"),
         (AnyTask, "a task that the dataset lacks must be refused, but is not"),
         (Dated, "must write the same bytes every time"),

@@ -176,5 +176,10 @@ def test_a_tracker_without_license_is_told_so() -> None:
         check_tracker(broken(right, license=""))
 
 
+def test_what_is_no_tracker_is_told_so() -> None:
+    with pytest.raises(AssertionError, match="it must be a Tracker, but is a dict"):
+        check_tracker(dict)  # type: ignore[arg-type]
+
+
 def test_what_breaks_nothing_passes() -> None:
     check_tracker(broken(right))
