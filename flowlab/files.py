@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError, MissingFileError
+from flowlab.errors import DataError, FlowlabError, MissingFileError
 
 
 def temporary_path(path: Path) -> Path:
@@ -35,14 +35,21 @@ def new_folder(path: Path) -> Iterator[Path]:
 
     Gives an empty folder beside it to fill, which takes its name in the end, or is deleted if anything is raised.
     What processes that no longer run were making beside it is deleted first.
+
+    Raises:
+        DataError: It cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(path.parent)
     temporary = temporary_path(path)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
         temporary.mkdir()
         yield temporary
         os.rename(temporary, path)
+    except FlowlabError:  # that a file to be read is missing is an OSError, too
+        raise
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

@@ -1,6 +1,7 @@
 """Arrays of a dataset decoded into files that are mapped into memory, once for each content of the dataset."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,9 @@ from flowlab.records import Episode
 INDEX = "index.json"
 """Written last: a folder that has it is whole."""
 _FORMAT = 3
+_FORM = re.compile(r"[0-9a-f]{16}-\d+(-\w+)?")
+"""What folders of decoded arrays are called, of this format and of earlier ones."""
+_MARKS = (INDEX, "corpus.json")
 ArraysOf = Callable[[Episode], tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]]
 """Takes out of an episode what is cached: arrays with a row per frame, and arrays of the whole episode."""
 
@@ -50,9 +54,9 @@ def cached_part(source: TrainingSource, fallback: Path, part: str, arrays_of: Ar
             temporary = temporary_path(writable)
             try:
                 _decode(source, temporary, arrays_of)
-                for other in writable.parent.glob("*"):
-                    if other == writable or not other.name.startswith((content, temporary.name)):
-                        shutil.rmtree(other, ignore_errors=True)
+                if writable == candidates[0]:  # of a folder of one's own, another dataset's arrays are not ours
+                    _remove_outdated(writable.parent, content)
+                shutil.rmtree(writable, ignore_errors=True)
                 os.replace(temporary, writable)
             except OSError as error:
                 raise DataError(f"{writable}: cannot be written ({error.strerror}); make room there") from error
@@ -72,7 +76,18 @@ def open_part(folder: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]
     return index["episodes"], {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in index["arrays"]}
 
 
+def _remove_outdated(cache: Path, content: str) -> None:
+    """Delete what was decoded of an earlier content of the dataset: folders of our form and mark, and nothing else."""
+    for other in cache.iterdir():
+        ours = _FORM.fullmatch(other.name) and any((other / mark).is_file() for mark in _MARKS)
+        if ours and not other.is_symlink() and not other.name.startswith(content):
+            shutil.rmtree(other, ignore_errors=True)
+
+
 def _is_writable(folder: Path) -> bool:
+    """Whether folders can be made here; a link could lead anywhere, so one is not followed."""
+    if folder.is_symlink():
+        return False
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

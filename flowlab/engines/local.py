@@ -2,13 +2,17 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from multiprocessing import get_context
-from typing import Self
+from contextlib import contextmanager
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from types import ModuleType
+from typing import Any, Self
 
 from pebble import ProcessExpired, ProcessPool
 
@@ -27,6 +31,51 @@ _WORKER_ENVIRONMENT = (
 """All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
 
 
+_STARTING = threading.Lock()
+"""The pool starts workers from threads of its own."""
+
+
+@contextmanager
+def _main_hidden() -> Iterator[None]:
+    """Let multiprocessing find a program that has no file, so that a worker does not run that of the user again."""
+    with _STARTING:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
+
+
+@contextmanager
+def _current_folder_hidden() -> Iterator[None]:
+    """Python started anew would look for modules in the current folder first, whatever lies there."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
+
+
+class _Worker(ForkServerProcess):
+    """A process that imports what it works with, and never the script that asked for it."""
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:
+        with _main_hidden():
+            return ForkServerProcess._Popen(process_obj)
+
+
+class _OwnProgramContext(ForkServerContext):
+    """Starts such workers: a script needs no ``if __name__ == "__main__"``."""
+
+    Process = _Worker
+
+
 class LocalEngine(Engine[Unit, Receipt]):
     """A pool of processes on this machine.
 
@@ -41,8 +90,10 @@ class LocalEngine(Engine[Unit, Receipt]):
         for name in _WORKER_ENVIRONMENT:
             os.environ.setdefault(name, "1")
         # Workers are forked from a clean process that has imported everything once, and share its memory.
-        context = get_context("forkserver")
+        context = _OwnProgramContext()
         context.set_forkserver_preload([*self.imports])
+        with _current_folder_hidden():
+            forkserver.ensure_running()
         self._pool = ProcessPool(
             max_workers=self.workers, context=context, initializer=_start_worker, initargs=[os.getpid()]
         )

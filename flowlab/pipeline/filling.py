@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from flowlab.engines.base import Engine, StartEngine, UnitResult, engine_by_name
-from flowlab.errors import FlowlabError, MissingFileError, UnfinishedError
+from flowlab.errors import DataError, FlowlabError, MissingFileError, UnfinishedError
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, UnitScheduler
 from flowlab.pipeline.units import JobShard, WorkUnit
@@ -59,7 +59,7 @@ def fill(
     except OSError as error:
         raise _storage_error(folder, error) from error
     except BaseException:
-        with suppress(OSError):  # what ended the run is what the user must hear of
+        with suppress(OSError, DataError):  # what ended the run is what the user must hear of
             summarize(folder)
         raise
     if failures:

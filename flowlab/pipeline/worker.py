@@ -2,15 +2,19 @@
 
 import resource
 import shutil
+from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from pathlib import Path
 
+from flowlab.errors import DataError
+from flowlab.files import locked
 from flowlab.pipeline.recipe import parse_recipe
 from flowlab.pipeline.stage import Pipeline, Rejected
 from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode
 from flowlab.storage import stats
-from flowlab.storage.receipts import Receipt, Reject, keep_receipt
+from flowlab.storage.receipts import Receipt, Reject, Widths, keep_receipt, known_widths
 from flowlab.storage.shard import episode_digest
 
 
@@ -42,22 +46,50 @@ def run_unit(
             about = request.model_dump()
             why = {"stage": rejected.stage, "reason": rejected.reason, "retry": rejected.retry}
             rejects.append(Reject(**about, **why, position=position))
-    for place, found in ("shards", episodes), ("rejects", kept):
-        _store(pipeline, folder / place / f"{unit.name}.zarr", found, settings_digest)
-    receipt = Receipt(
-        unit=unit.name,
-        task=unit.task,
-        seeds=unit.seeds,
-        accepted=tuple(e.seed for e in episodes),
-        frames=tuple(len(e) for e in episodes),
-        digests=tuple(episode_digest(e) for e in episodes),
-        rejects=tuple(rejects),
-        stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
-        stats=stats.summarize(episodes) if episodes else {},
-        peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-    )
-    keep_receipt(folder, receipt)
+    known = known_widths(folder)
+    with nullcontext() if known else locked(folder):  # the first episodes decide, and only one unit has them
+        episodes, misfits = _fitting(episodes, known or known_widths(folder), unit)
+        for place, found in ("shards", episodes), ("rejects", kept):
+            _store(pipeline, folder / place / f"{unit.name}.zarr", found, settings_digest)
+        receipt = Receipt(
+            unit=unit.name,
+            task=unit.task,
+            seeds=unit.seeds,
+            accepted=tuple(e.seed for e in episodes),
+            frames=tuple(len(e) for e in episodes),
+            digests=tuple(episode_digest(e) for e in episodes),
+            rejects=(*rejects, *misfits),
+            stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
+            stats=stats.summarize(episodes) if episodes else {},
+            peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        )
+        keep_receipt(folder, receipt)
     return receipt
+
+
+def _fitting(episodes: Sequence[Episode], known: Widths | None, unit: WorkUnit) -> tuple[list[Episode], list[Reject]]:
+    """The episodes that are as wide as the dataset's, and why the others are not kept.
+
+    Raises :class:`DataError` in simulation, where the next seed would be no better.
+    """
+    fitting: list[Episode] = []
+    misfits: list[Reject] = []
+    sources = {request.seed: request.source for request in unit.requests}
+    for episode in episodes:
+        widths = Widths(episode.state.shape[1], episode.action.shape[1])
+        known = known or widths
+        problem = known.problem(widths)
+        source = sources.get(episode.seed, "")
+        if not problem:
+            fitting.append(episode)
+        elif source:
+            reason = f"{problem}; give it as many, or label it into another --out"
+            misfits.append(
+                Reject(task=unit.task, seed=episode.seed, stage="write", reason=reason, source=source, retry=True)
+            )
+        else:
+            raise DataError(f"{unit.task} seed {episode.seed}: {problem}; make this task in another --out")
+    return fitting, misfits
 
 
 def _store(pipeline: Pipeline, path: Path, episodes: list[Episode], settings_digest: str) -> None:

@@ -17,7 +17,7 @@ from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
 from flowlab.storage.episodes import EpisodeRef, EpisodeSequence
 from flowlab.storage.manifest import MANIFEST, Manifest, differences
-from flowlab.storage.receipts import read_receipts
+from flowlab.storage.receipts import check_widths, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.shard import Shard
 
@@ -151,7 +151,12 @@ class Dataset(EpisodeSequence):
 
     @cached_property
     def stats(self) -> dict[str, Any]:
-        """Limits, mean and deviation of every array, and how much moves."""
+        """Limits, mean and deviation of every array, and how much moves.
+
+        Raises:
+            DataError: Some episodes have wider states or actions than others.
+        """
+        check_widths(self.path, self.receipts)
         return stats.describe(stats.merge(dict(r.stats) for r in self.receipts if r.accepted))
 
     @property

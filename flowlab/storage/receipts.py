@@ -1,7 +1,8 @@
 """Receipts: one JSON record per work unit, that says what became of it and makes its shard count."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,22 @@ class StageTally(Settings):
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Widths:
+    """How many numbers a state and an action have, the same in all episodes of a dataset."""
+
+    state: int
+    action: int
+
+    def problem(self, other: "Widths") -> str:
+        """In what others differ from the dataset's, in words; empty where they do not."""
+        for name in ("state", "action"):
+            mine, found = getattr(self, name), getattr(other, name)
+            if mine != found:
+                return f"its {name} has {found} numbers a step, that of the dataset's other episodes {mine}"
+        return ""
+
+
 class Receipt(Settings):
     """What became of one work unit; a shard without a receipt does not count."""
 
@@ -70,6 +87,13 @@ class Receipt(Settings):
     flowlab: str = __version__
 
     @model_validator(mode="after")
+    def _plain_names(self) -> "Receipt":
+        for name in (self.unit, self.task):
+            if not name or name.startswith(".") or "/" in name or "\0" in name:
+                raise ValueError(f"'{name}' is no plain name; unit and task name files of this dataset")
+        return self
+
+    @model_validator(mode="after")
     def _lists_match(self) -> "Receipt":
         if not len(self.accepted) == len(self.frames) == len(self.digests):
             raise ValueError("accepted, frames and digests must be equally long")
@@ -81,6 +105,14 @@ class Receipt(Settings):
         return f"shards/{self.unit}.zarr"
 
     @property
+    def widths(self) -> "Widths | None":
+        """How many numbers a state and an action of its episodes have; None where that is not known."""
+        if not self.accepted or "arrays" not in self.stats:
+            return None
+        moments = self.stats["arrays"]
+        return Widths(*(len(moments[name]["mean"]) if name in moments else 0 for name in ("state", "action")))
+
+    @property
     def rejects_shard(self) -> str:
         """Path below the dataset of the shard that keeps rejected episodes, where there are any to keep."""
         return f"rejects/{self.unit}.zarr"
@@ -88,17 +120,43 @@ class Receipt(Settings):
 
 def read_receipts(folder: Path) -> list[Receipt]:
     """All receipts of a dataset, by task and seed."""
-    receipts = []
+    return sorted(_receipts(folder), key=lambda r: (r.task, r.seeds))
+
+
+def known_widths(folder: Path) -> Widths | None:
+    """What all episodes of a dataset have as state and action; None as long as there is no episode."""
+    return next((widths for receipt in _receipts(folder) if (widths := receipt.widths)), None)
+
+
+def check_widths(folder: Path, receipts: Iterable[Receipt]) -> None:
+    """Raises :class:`DataError` where some episodes of a dataset have wider states or actions than others."""
+    first: Receipt | None = None
+    for receipt in receipts:
+        if receipt.widths is None:
+            continue
+        first = first or receipt
+        assert first.widths is not None
+        if problem := first.widths.problem(receipt.widths):
+            raise DataError(
+                f"{folder}: an episode does not fit, {problem} ({receipt.unit} and {first.unit}); a dataset has one "
+                f"width: make those of another one in another --out, and remove {folder}/receipts/{receipt.unit}.json"
+            )
+
+
+def _receipts(folder: Path) -> Iterator[Receipt]:
+    """All receipts of a dataset, as they are found."""
     for path in (folder / "receipts").glob("*.json"):
         if path.name.startswith("."):
             continue
         try:
-            receipts.append(Receipt.model_validate(migrate_receipt(read_json(path))))
+            receipt = Receipt.model_validate(migrate_receipt(read_json(path)))
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(map(str, first["loc"])) or "lists"
             raise DataError(f"{path}: field '{field}': {first['msg']}") from error
-    return sorted(receipts, key=lambda r: (r.task, r.seeds))
+        if receipt.unit != path.stem:
+            raise DataError(f"{path}: field 'unit': is '{receipt.unit}', expected '{path.stem}' as the file is called")
+        yield receipt
 
 
 def keep_receipt(folder: Path, receipt: Receipt) -> None:

@@ -11,7 +11,7 @@ from flowlab.provenance import Provenance
 from flowlab.storage.checks import ArrayProblem, episode_problems
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import MANIFEST
-from flowlab.storage.receipts import Receipt
+from flowlab.storage.receipts import Receipt, check_widths
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA
 from flowlab.storage.shard import Shard, episode_digest
 
@@ -75,6 +75,10 @@ def _check_books(dataset: Dataset) -> Iterator[Finding]:
         asked = dataset.manifest.requested[task]
         problem = f"{task}: {asked - missing} of {asked} {what}; run the same extract command again for the rest"
         yield Finding(str(path / MANIFEST), problem)
+    try:
+        check_widths(path, dataset.receipts)
+    except DataError as error:
+        yield _finding(path, error)
     kept = {r.rejects_shard for r in dataset.receipts if any(x.position is not None for x in r.rejects)}
     counted = kept | {r.shard for r in dataset.receipts if r.accepted}
     for shard in sorted([*(path / "shards").glob("*.zarr"), *(path / "rejects").glob("*.zarr")]):

@@ -256,3 +256,20 @@ def test_pictures_of_some_episodes_only_are_refused(tmp_path: Path) -> None:
     load_buffer(source, tmp_path / "run")
     with pytest.raises(DataError, match="roll seed 2: 'rgb' is in some episodes only; train on those that have it"):
         load_buffer(source, tmp_path / "run", ("rgb",))
+
+
+def test_nothing_is_deleted_that_is_not_ours(tmp_path: Path) -> None:
+    """A stranger's dataset may have anything in its cache, or a link in its place."""
+    data, home = tmp_path / "data", tmp_path / "home"
+    make_dataset(data, [[make_episode(0)]])
+    for folder in (data / "cache" / "photos", data / "cache" / "0123456789abcdef-1", home / "photos"):
+        folder.mkdir(parents=True)
+        (folder / "a.txt").write_text("kept")
+    load_buffer(open_training_source(data), tmp_path / "run")
+    assert (data / "cache" / "photos" / "a.txt").exists()
+    assert (data / "cache" / "0123456789abcdef-1" / "a.txt").exists(), "our form, but not our mark"
+    shutil.rmtree(data / "cache")
+    (data / "cache").symlink_to(home, target_is_directory=True)
+    load_buffer(open_training_source(data), tmp_path / "run")
+    assert (home / "photos" / "a.txt").exists()
+    assert [p.name for p in home.iterdir()] == ["photos"]

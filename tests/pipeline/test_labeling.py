@@ -327,3 +327,19 @@ def test_a_forecast_is_measured_on_what_can_be_labeled(tmp_path: Path, recording
     nothing = estimate_cost(recipe, broken)
     assert nothing.cpu_s_per_frame is None
     assert nothing.basis.startswith(f"no recording can be labeled: {tmp_path / 'a/c'}")
+
+
+def test_recordings_of_another_width_are_rejected(recordings: Path, recipe: Recipe, tmp_path: Path) -> None:
+    """Whatever else is in the folder, the dataset can be read, and says what to do with the other."""
+    folder = tmp_path / "slide"
+    record(folder / "1", action=np.ones((20, 4), np.float32))
+    record(folder / "2")
+    made = label(recipe, find_jobs(recipe, [folder]), tmp_path / "data")
+    (kept,) = made
+    assert kept.action.shape == (20, 4)
+    assert made.stats["episodes"] == 1
+    (reject,) = made.rejects
+    assert reject.reason == (
+        "its action has 2 numbers a step, that of the dataset's other episodes 4; give it as many, or label it into "
+        "another --out"
+    )

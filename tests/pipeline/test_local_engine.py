@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import flowlab
 from flowlab.engines.base import UnitResult
 from flowlab.engines.local import LocalEngine
 from flowlab.errors import DataError
@@ -156,3 +157,38 @@ def test_workers_are_single_threaded_and_do_not_outlive_their_parent(tmp_path: P
         parent.kill()
         parent.wait()
     assert wait_for(lambda: not any(alive(pid) for pid, _ in workers), 10), "orphans are left"
+
+
+def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
+    """Workers import what they work with, and not the program that asked for it."""
+    script = tmp_path / "script" / "main.py"
+    script.parent.mkdir()
+    script.write_text(
+        "import sys, pathlib, flowlab\n"
+        "with open(sys.argv[1], 'a') as log:\n"
+        "    log.write('ran ')\n"
+        "few = ['observer.points=64']\n"
+        "dataset = flowlab.extract('drawer-open', sys.argv[2], episodes=1, settings=few, workers=1)\n"
+        "print(len(dataset))\n"
+    )
+    log = tmp_path / "log"
+    done = subprocess.run(
+        [sys.executable, script, log, tmp_path / "data"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stdout, log.read_text()) == (0, "1\n", "ran "), done.stderr[-500:]
+
+
+def test_nothing_in_the_current_folder_is_run(tmp_path: Path) -> None:
+    """Somebody works in a folder of downloaded files; the console script does not look there, nor do its workers."""
+    for name in ("json", "yaml", "numpy", "queue"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})\n")
+    script = tmp_path / "bin" / "flowlab"
+    script.parent.mkdir()
+    script.write_text("import sys\nfrom flowlab.cli import main\nmain()\n")
+    arguments = ["extract-sim", "reach", "--episodes", "1", "--workers", "1", "--out", tmp_path / "data"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(flowlab.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, script, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "ran").exists(), (tmp_path / "ran").read_text()

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from flowlab.storage.manifest import MANIFEST
 from flowlab.storage.receipts import Receipt, Reject, StageTally, keep_receipt
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.shard import Shard, write_shard
+from flowlab.storage.validation import validate
 
 EPISODES = [make_episode(k, task=task, steps=6 + k) for task in ("roll", "push") for k in range(3)]
 
@@ -383,3 +385,14 @@ def test_what_was_rejected_can_be_listed_and_looked_at(tmp_path: Path) -> None:
         "task": "roll", "seed": 3, "stage": "quality", "reason": "because 3", "source": "/rec/c", "position": 0,
     }  # fmt: skip
     assert lines[1] == {"task": "roll", "seed": 2, "stage": "recording", "reason": "because 2"}
+
+
+def test_a_dataset_of_two_widths_is_told_in_a_sentence(tmp_path: Path) -> None:
+    """As an earlier flowlab could make it."""
+    wide = make_episode(0)
+    narrow = make_episode(1)
+    narrow = replace(narrow, action=narrow.action[:, :2])
+    with pytest.raises(DataError, match="its action has 2 numbers a step, that of the dataset's other episodes 4"):
+        make_dataset(tmp_path / "d", [[wide], [narrow]])
+    (told,) = [f for f in validate(tmp_path / "d") if "numbers a step" in f.problem]
+    assert "another --out" in told.problem

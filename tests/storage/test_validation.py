@@ -13,9 +13,10 @@ import zarr
 from conftest import Cli
 from synthetic import call_cli, make_dataset, make_episode, make_receipt, with_quality, with_tracks
 
+from flowlab.errors import DataError
 from flowlab.records import Episode, PositionSource
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.receipts import Reject, keep_receipt
+from flowlab.storage.receipts import Reject, keep_receipt, read_receipts
 from flowlab.storage.shard import Shard, episode_digest, write_shard
 from flowlab.storage.validation import validate
 
@@ -379,3 +380,16 @@ def test_a_kept_reject_must_be_there_and_no_other(tmp_path: Path) -> None:
     write_shard(tmp_path / "rejects/roll-000002.zarr", [make_episode(2)], data.manifest.settings_digest)
     (finding,) = validate(tmp_path)
     assert finding.place == f"{tmp_path}/rejects/roll-000002.zarr"
+
+
+@pytest.mark.parametrize("name", ["../../victim", "/abs", ".hidden", ""])
+def test_a_receipt_with_a_name_that_leads_elsewhere_is_refused(name: str, tmp_path: Path) -> None:
+    make_dataset(tmp_path / "data", [[make_episode(0)]])
+    (file,) = (tmp_path / "data" / "receipts").glob("*.json")
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps({**values, "unit": name}))
+    with pytest.raises(DataError, match="is no plain name"):
+        read_receipts(tmp_path / "data")
+    file.write_text(json.dumps({**values, "unit": "push-000009"}))
+    with pytest.raises(DataError, match="as the file is called"):
+        read_receipts(tmp_path / "data")

@@ -7,7 +7,6 @@ import numpy as np
 import zarr
 from numcodecs import Blosc
 
-from flowlab.errors import DataError
 from flowlab.files import new_folder
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.base import Exporter, select_episodes
@@ -32,13 +31,10 @@ class DP3Exporter(Exporter):
         chosen = select_episodes(dataset, path, task)
         ends = np.cumsum([ref.frames for ref in chosen], dtype=np.int64)
         start = {(ref.task, ref.seed): int(end) - ref.frames for ref, end in zip(chosen, ends, strict=True)}
-        try:
-            with new_folder(path) as temporary:
-                group = zarr.create_group(temporary, zarr_format=2)
-                _write_steps(group, dataset, start, int(ends[-1]))
-                _create(group, "meta/episode_ends", ends.shape, "int64")[...] = ends
-        except OSError as error:
-            raise DataError(f"{path}: cannot be written ({error.strerror or error}); choose another --out") from error
+        with new_folder(path) as temporary:
+            group = zarr.create_group(temporary, zarr_format=2)
+            _write_steps(group, dataset, start, int(ends[-1]))
+            _create(group, "meta/episode_ends", ends.shape, "int64")[...] = ends
         return len(chosen)
 
 
