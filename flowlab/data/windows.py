@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from flowlab.arguments import check_counts
 from flowlab.data.cache import cached_part, open_part
 from flowlab.data.replay_buffer import ARRAYS, arrays_of, pictures_of
-from flowlab.data.source import TrainingSource, open_training_source, source_of
+from flowlab.data.source import TrainingSource, open_training_source, path_of, source_of
 from flowlab.data.window_stats import describe_rows
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.storage.dataset import Dataset
@@ -63,7 +65,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         tolerance_s: float = 1e-4,
         cache: Path | str | None = None,
     ) -> None:
-        source = source_of(data) if isinstance(data, Dataset) else open_training_source(Path(data))
+        source = source_of(data) if isinstance(data, Dataset) else open_training_source(path_of(data))
         fallback = source.path if cache is None else Path(cache)
         self.path = source.path
         self._statistics = source.statistics["arrays"]
@@ -92,6 +94,10 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         return int(self.episode_ends[-1])
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        if not isinstance(index, Integral):
+            raise UsageError(
+                f"{self.path}: windows are counted from 0, and one is asked for at a time; found {index!r}"
+            )
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: there are {len(self)} windows, and no window {index}")
         index = index % len(self)
@@ -164,6 +170,8 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         self, key: str, times: Sequence[float], source: TrainingSource, tolerance_s: float
     ) -> Int[np.ndarray, "T"]:
         step = self._step_s(source, tolerance_s)
+        if not all(isinstance(t, Real) and np.isfinite(t) for t in times):
+            raise UsageError(f"{self.path}: delta_timestamps of '{key}': must be times [s]; found {times!r}")
         rows = np.round(np.asarray(times, float) / step).astype(int)
         for time, row in zip(times, rows, strict=True):
             if abs(time - row * step) > tolerance_s:
@@ -197,6 +205,10 @@ def _one_of(
         )
     asked = offsets if offsets is not None else delta_timestamps
     assert asked is not None
+    if not isinstance(asked, Mapping) or not asked:
+        raise UsageError(
+            f"Windows: say for every array which rows, as in {{'state': [-1, 0], 'action': range(8)}}; found {asked!r}"
+        )
     return asked
 
 
@@ -208,7 +220,7 @@ def _rows(offsets: Sequence[int]) -> Int[np.ndarray, "T"]:
 
 
 def _chosen(episodes: Sequence[int] | None, count: int, path: Path) -> tuple[int, ...]:
-    chosen = tuple(range(count)) if episodes is None else tuple(episodes)
+    chosen = tuple(range(count)) if episodes is None else check_counts(episodes, "episodes", least=None)
     for k in chosen:
         if not 0 <= k < count:
             raise UsageError(f"{path}: no episode {k}; there are {count}, counted from 0")

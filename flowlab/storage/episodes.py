@@ -4,10 +4,11 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import overload
 
-from flowlab.errors import DataError, unknown_name
+from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
 from flowlab.storage.shard import Shard
 
@@ -52,10 +53,14 @@ class EpisodeSequence(Sequence[Episode], ABC):
 
         Raises:
             IndexError: There is no such episode.
+            UsageError: The index is no number.
             DataError: Its shard is missing or damaged.
         """
         if isinstance(index, slice):
             return DatasetView(self.path, self.refs[index])
+        if not isinstance(index, Integral):
+            hint = f".task({index!r}) has the episodes of a task" if isinstance(index, str) else "as in dataset[0]"
+            raise UsageError(f"{self.path}: episodes are counted from 0, and {index!r} is no number; {hint}")
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
         ref = self.refs[index]
