@@ -3,6 +3,7 @@
 The command line has its own checks of what is typed; these are the same limits for those who call a function.
 """
 
+import math
 import os
 from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
@@ -98,6 +99,16 @@ def check_minutes(value: Any, name: str = "minutes") -> float | None:
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < float("inf"):
         raise _wrong(name, value, "a number above 0, or None")
     return float(value)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number, NumPy's too."""
+    return isinstance(value, Integral)
+
+
+def is_finite(value: Any) -> bool:
+    """Whether it is a number, and neither infinite nor none."""
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _listed(value: Any, kind: Any) -> tuple[Any, ...] | None:

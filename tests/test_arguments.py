@@ -47,9 +47,9 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "none to evaluate": (lambda: flowlab.evaluate("r", episodes=0), "episodes: must be a whole number from 1 on"),
     "recordings": (lambda: flowlab.label([3], "d"), "paths: must be a path or a list of paths; found [3]"),  # type: ignore[list-item]
     "seed of a policy": (
-        lambda: flowlab.Policy.load("r", seed="a"),
+        lambda: flowlab.Policy.load("r", seed="a"),  # type: ignore[arg-type]
         "seed: must be a whole number from 0 on; found 'a'",
-    ),  # type: ignore[arg-type]
+    ),
     "tracker": (lambda: flowlab.grade("r", trackers=3), "trackers: must be a name or a list of names; found 3"),  # type: ignore[arg-type]
 }
 
@@ -115,7 +115,7 @@ def test_an_open_dataset_can_be_trained_on(dataset: flowlab.Dataset, tmp_path: P
 def test_an_episode_is_asked_for_by_number(dataset: flowlab.Dataset, index: Any, says: str) -> None:
     with pytest.raises(flowlab.UsageError, match=says):
         dataset[index]
-    assert dataset[np.int64(1)].seed == 1
+    assert dataset[np.int64(1)].seed == 1  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize(

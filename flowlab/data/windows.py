@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
-from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from flowlab.arguments import check_counts
+from flowlab.arguments import check_counts, is_finite, is_whole
 from flowlab.data.cache import cached_part, open_part
 from flowlab.data.replay_buffer import ARRAYS, arrays_of, pictures_of
 from flowlab.data.source import TrainingSource, open_training_source, path_of, source_of
@@ -94,7 +93,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         return int(self.episode_ends[-1])
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        if not isinstance(index, Integral):
+        if not is_whole(index):
             raise UsageError(
                 f"{self.path}: windows are counted from 0, and one is asked for at a time; found {index!r}"
             )
@@ -170,7 +169,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         self, key: str, times: Sequence[float], source: TrainingSource, tolerance_s: float
     ) -> Int[np.ndarray, "T"]:
         step = self._step_s(source, tolerance_s)
-        if not all(isinstance(t, Real) and np.isfinite(t) for t in times):
+        if not all(is_finite(t) for t in times):
             raise UsageError(f"{self.path}: delta_timestamps of '{key}': must be times [s]; found {times!r}")
         rows = np.round(np.asarray(times, float) / step).astype(int)
         for time, row in zip(times, rows, strict=True):

@@ -58,7 +58,7 @@ class _Worker(ForkServerProcess):
 class _OwnProgramContext(ForkServerContext):
     """Starts such workers: a script needs no ``if __name__ == "__main__"``."""
 
-    Process = _Worker  # type: ignore[assignment]
+    Process = _Worker
 
 
 class LocalEngine(Engine[Unit, Receipt]):

@@ -4,10 +4,10 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import overload
 
+from flowlab.arguments import is_whole
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
 from flowlab.storage.shard import Shard
@@ -58,7 +58,7 @@ class EpisodeSequence(Sequence[Episode], ABC):
         """
         if isinstance(index, slice):
             return DatasetView(self.path, self.refs[index])
-        if not isinstance(index, Integral):
+        if not is_whole(index):
             hint = f".task({index!r}) has the episodes of a task" if isinstance(index, str) else "as in dataset[0]"
             raise UsageError(f"{self.path}: episodes are counted from 0, and {index!r} is no number; {hint}")
         if not -len(self) <= index < len(self):
