@@ -111,7 +111,10 @@ def test_an_open_dataset_can_be_trained_on(dataset: flowlab.Dataset, tmp_path: P
     assert len(Windows(dataset, {"state": [0]})) == 24
 
 
-@pytest.mark.parametrize(("index", "says"), [("roll", r"\.task\('roll'\)"), ([0, 1], r"dataset\[0\]")])
+@pytest.mark.parametrize(
+    ("index", "says"),
+    [("roll", r"'roll' is no number; those of a task are dataset\.task\('push'\)"), ([0, 1], r"dataset\[0\]")],
+)
 def test_an_episode_is_asked_for_by_number(dataset: flowlab.Dataset, index: Any, says: str) -> None:
     with pytest.raises(flowlab.UsageError, match=says):
         dataset[index]

@@ -52,7 +52,7 @@ class _Worker(ForkServerProcess):
     @staticmethod
     def _Popen(process_obj: Any) -> Any:
         with _main_hidden():
-            return ForkServerProcess._Popen(process_obj)  # type: ignore[attr-defined]
+            return ForkServerProcess._Popen(process_obj)
 
 
 class _OwnProgramContext(ForkServerContext):

@@ -59,8 +59,10 @@ class EpisodeSequence(Sequence[Episode], ABC):
         if isinstance(index, slice):
             return DatasetView(self.path, self.refs[index])
         if not is_whole(index):
-            hint = f".task({index!r}) has the episodes of a task" if isinstance(index, str) else "as in dataset[0]"
-            raise UsageError(f"{self.path}: episodes are counted from 0, and {index!r} is no number; {hint}")
+            raise UsageError(
+                f"{self.path}: episodes are counted from 0, as in dataset[0], and {index!r} is no number; those of a task "
+                "are dataset.task('push')"
+            )
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
         ref = self.refs[index]
