@@ -78,6 +78,14 @@ class Registry(Generic[T]):
             raise UsageError(f"{self.kind} '{name}': is not a subclass of {base.__module__}.{base.__qualname__}")
         return loaded
 
+    def _where(self, error: BaseException, folder: Path | None) -> str:
+        """Where a module that was not found may lie, to be added to an error; empty where another thing went wrong."""
+        if not isinstance(error, ModuleNotFoundError):
+            return ""
+        beside = {"stages": ", or its file beside the recipe that names it"}.get(self.family, "")
+        looked = f" (looked in {folder.resolve()}, too)" if folder is not None else ""
+        return f"; install what has this {self.kind}, or put its module's folder on PYTHONPATH{beside}{looked}"
+
     def _entries(self) -> list[EntryPoint]:
         return sorted(entry_points(group=self.group), key=lambda e: e.name)
 
@@ -107,7 +115,9 @@ class Registry(Generic[T]):
                 _remember(package, imported, folder)
                 return getattr(imported, attribute)
             except Exception as error:  # whatever somebody's module does
-                raise UsageError(f"{self.kind} '{place}': cannot be imported ({first_line(error)})") from error
+                raise UsageError(
+                    f"{self.kind} '{place}': cannot be imported ({first_line(error)}){self._where(error, folder)}"
+                ) from error
 
 
 TRACKERS: Registry[Any] = Registry("trackers", "tracker", "flowlab.tracking.base:Tracker")

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError
+from flowlab.arguments import check_path
+from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset
+from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
 
 
@@ -38,6 +40,21 @@ def open_training_source(path: Path) -> TrainingSource:
         imported = Provenance(kind="imported")
         return TrainingSource(path, store.fingerprint, sum(store.frames), store.episodes, described, imported)
     return source_of(Dataset(path))
+
+
+def path_of(data: Dataset | Path | str) -> Path:
+    """Where what is to be trained on lies, opened or not.
+
+    Raises:
+        UsageError: It is some episodes of a dataset, or no path at all.
+    """
+    if isinstance(data, DatasetView):
+        raise UsageError(
+            f"data: these are {len(data)} episodes of {data.path}, and what is trained on is a dataset of its own; "
+            "make one of their task, as with flowlab.extract('push', 'data/push'), or give flowlab.data.Windows the "
+            "dataset and episodes=[...]"
+        )
+    return data.path if isinstance(data, Dataset) else check_path(data, "data")
 
 
 def source_of(dataset: Dataset) -> TrainingSource:

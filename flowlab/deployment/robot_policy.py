@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 
+from flowlab.arguments import check_count, check_optional_count, check_path
 from flowlab.deployment.inputs import check_frame, check_state, explain_empty_cloud, made_up_frame
 from flowlab.deployment.runner import PolicyRunner
 from flowlab.errors import DataError, UsageError, unknown_name
@@ -54,13 +55,22 @@ class Policy:
             DataError: There is no policy, or it is damaged.
             UsageError: An argument does not fit it.
         """
+        execute = check_optional_count(execute, "execute")
+        check_count(seed, "seed", 0)
         _check_device(device)
-        network = load_policy(Path(run), device).policy
+        network = load_policy(check_path(run, "run"), device).policy
         s = network.spec.settings
         most = s.horizon - s.n_obs_steps + 1
         if execute is not None and not 1 <= execute <= most:
             raise UsageError(f"{run}: execute is {execute}, and plans reach {most} steps ahead; use 1 to {most}")
         return cls(network, _choose_task(network.spec.tasks, task, run), seed, execute)
+
+    def __repr__(self) -> str:
+        settings = self.network.spec.settings
+        return (
+            f"Policy({settings.policy} for {self.task}: state of {self.network.spec.state_width} numbers, action of "
+            f"{self.network.spec.action_width}, {self.n_action_steps} steps of each plan executed; at step {self.step})"
+        )
 
     def reset(self, seed: int | None = None) -> None:
         """Begin a new episode.
@@ -68,7 +78,7 @@ class Policy:
         Args:
             seed: Of the noise of its plans; by default one more than the last episode's.
         """
-        self._seed = self._seed + 1 if seed is None else seed
+        self._seed = self._seed + 1 if seed is None else check_count(seed, "seed", 0)
         self._runner = PolicyRunner(self.network.spec, self.task, self._seed, self._execute)
         self.step = 0
         """Of the episode: which step the next action is for."""
@@ -110,8 +120,9 @@ class Policy:
             DataError: The frame shows nothing in the policy's workspace.
         """
         state = self._checked_state(state)
-        if self.wants_frame:
-            self._observe(self._runner, self._checked_frame(observation), state)
+        if self._runner.needs_state:
+            frame = self._checked_frame(observation) if self.wants_frame else None
+            self._observe(self._runner, frame, state)
         if self._runner.needs_plan:
             self.flow = self._plan(self._runner)
             self.planned_at = self.step
@@ -146,11 +157,12 @@ class Policy:
             seconds = time.perf_counter() - began
         return seconds
 
-    def _observe(self, runner: PolicyRunner, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
+    def _observe(self, runner: PolicyRunner, frame: Frame | None, state: Float32[np.ndarray, "S"]) -> None:
         """Show the runner a frame; what is wrong with it is said with the step."""
         try:
             runner.observe(frame, state)
         except DataError as error:
+            assert frame is not None
             empty = not len(Observer(self._observer_settings, self.task).cloud(frame).xyz_world)
             workspace = self._observer_settings.crop_for(self.task)
             reason = explain_empty_cloud(frame, workspace) if empty else str(error)

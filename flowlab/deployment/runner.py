@@ -36,6 +36,7 @@ class PolicyRunner:
 
     def __init__(self, spec: PolicySpec, task: str, seed: int, n_action_steps: int | None = None) -> None:
         needs = spec.settings.needs
+        self._needs_picture = needs.point_cloud is not None or needs.flow is not None or bool(needs.pictures)
         self._needs_cloud = needs.point_cloud is not None or needs.flow is not None
         if self._needs_cloud and spec.observer is None:
             raise DataError("the policy was trained on clouds whose making is not known, so nobody can make such again")
@@ -58,16 +59,21 @@ class PolicyRunner:
         return not self._actions
 
     @property
-    def needs_frame(self) -> bool:
-        """Whether a plan will be decided on the frame of this step."""
+    def needs_state(self) -> bool:
+        """Whether a plan will be decided on this step."""
         return len(self._actions) < self.spec.settings.n_obs_steps
 
-    def observe(self, frame: Frame, state: Float32[np.ndarray, "S"]) -> None:
+    @property
+    def needs_frame(self) -> bool:
+        """Whether a plan will be decided on the frame of this step."""
+        return self._needs_picture and self.needs_state
+
+    def observe(self, frame: Frame | None, state: Float32[np.ndarray, "S"]) -> None:
         """Take in a step that a plan will be decided on.
 
         Args:
             frame: What the camera sees: depth [m], the camera's pose in the dataset's world frame, and color where the
-                policy needs it.
+                policy needs it. None where :attr:`needs_frame` is False.
             state: The robot's, laid out as in the training data.
 
         Raises:
@@ -75,16 +81,20 @@ class PolicyRunner:
             UsageError: The policy needs color, and the frame has none.
         """
         needs, first = self.spec.settings.needs, not self._history
-        if needs.rgb and frame.rgb is None:
+        if frame is None:
+            if self.needs_frame:
+                raise UsageError("the policy needs the frame of this step, and got None")
+        elif needs.rgb and frame.rgb is None:
             raise UsageError("the policy needs color, and the frame has none; give it as rgb, of the size of the depth")
         points = _NO_POINTS
-        if self._needs_cloud:
+        if self._needs_cloud and frame is not None:
             cloud = self._observer.cloud(frame)
             if needs.point_cloud is not None:
                 points = self._observer.sample(cloud).points_world[: needs.point_cloud.points]
             if first and needs.flow is not None:
                 self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
-        rgb, depth = frame.rgb if needs.rgb else None, frame.depth if needs.depth else None
+        rgb = frame.rgb if needs.rgb and frame is not None else None
+        depth = frame.depth if needs.depth and frame is not None else None
         step = _ObservedStep(points, np.asarray(state, np.float32), rgb, depth)
         times = self.spec.settings.n_obs_steps if first else 1  # what was before the first step is taken to be like it
         self._history.extend([step] * times)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Self, TypeVar
 
+from flowlab.arguments import check_optional_count
 from flowlab.registry import ENGINES
 
 Unit = TypeVar("Unit")
@@ -81,7 +82,7 @@ def engine_by_name(
         imports: Modules that a worker will need.
 
     Raises:
-        UsageError: There is no such engine.
+        UsageError: There is no such engine, or fewer than one worker.
     """
     engine: Any = ENGINES.load(name)
-    return partial(engine, workers=workers or core_count(), imports=imports)
+    return partial(engine, workers=check_optional_count(workers, "workers") or core_count(), imports=imports)

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 
+from flowlab.arguments import check_count, check_counts, check_names, check_optional_count, check_paths
 from flowlab.config import Settings
 from flowlab.engines.base import StartEngine, core_count, engine_by_name
-from flowlab.errors import UnfinishedError
+from flowlab.errors import UnfinishedError, UsageError
 from flowlab.evaluation.checkpoints import CheckpointRef, common_tasks, find_checkpoint, find_checkpoints
 from flowlab.evaluation.episode_log import append_result, read_results, repair_tail
 from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult
@@ -40,8 +41,8 @@ class EpisodeBatch(Settings):
 def evaluate(
     runs: Path | str | Sequence[Path | str],
     *,
-    tasks: Sequence[str] = (),
-    seeds: Sequence[int] = (0, 1, 2),
+    tasks: Sequence[str] | str = (),
+    seeds: Sequence[int] | int = (0, 1, 2),
     episodes: int = 20,
     n_action_steps: int | None = None,
     checkpoints: bool = False,
@@ -75,7 +76,18 @@ def evaluate(
         UsageError: A name or number does not fit, or a scene was trained on.
         UnfinishedError: Workers failed; the same call tries their episodes again.
     """
-    paths = [Path(runs)] if isinstance(runs, Path | str) else [Path(run) for run in runs]
+    paths = check_paths(runs, "runs")
+    if not paths:
+        raise UsageError(
+            "runs: there is none to evaluate; give the folder of a run, as in flowlab.evaluate('runs/fdp')"
+        )
+    tasks, seeds, episodes = (
+        check_names(tasks, "tasks"),
+        check_counts(seeds, "seeds", least=None),
+        check_count(episodes, "episodes"),
+    )
+    n_action_steps = check_optional_count(n_action_steps, "n_action_steps")
+    workers = check_optional_count(workers, "workers")
     refs = [ref for path in paths for ref in _checkpoints_of(path, n_action_steps, every=checkpoints)]
     trials = list_trials(common_tasks(refs, tasks), seeds, episodes)
     found = evaluate_checkpoints(

@@ -135,11 +135,9 @@ class _RunningEpisode:
 
     def observe(self) -> None:
         """Show the policy the present, if a plan will be decided on it."""
-        needed = self.runner.needs_frame
-        if not (needed or self.render_every_step):
-            return
-        frame = self.recorder.frame()
-        if needed:
+        wanted = self.runner.needs_frame or self.render_every_step
+        frame = self.recorder.frame() if wanted else None
+        if self.runner.needs_state:
             try:
                 self.runner.observe(frame, self.recorder.simulation.state)
             except DataError as error:

@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from flowlab.arguments import check_count, check_names, check_path, check_paths, check_settings
 from flowlab.errors import FlowlabError, MissingLibraryError, UsageError, unknown_name
 from flowlab.files import write_json
 from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_tracker
@@ -18,6 +19,7 @@ from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.lifting import LiftSettings
 
 REPORT = "grade.json"
+_SETTINGS_FORM = "a list of strings, as in settings=['chunk=33']"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +48,11 @@ class GradingReport:
 
 
 def grade(
-    recordings: Sequence[Path | str] = (),
+    recordings: Sequence[Path | str] | Path | str = (),
     out: Path | str = "grade",
     *,
-    trackers: Sequence[str] = ("rigid-bodies",),
-    tasks: Sequence[str] = (),
+    trackers: Sequence[str] | str = ("rigid-bodies",),
+    tasks: Sequence[str] | str = (),
     episodes: int = 1,
     seed: int = 0,
     sensor: str = "kinect",
@@ -84,11 +86,13 @@ def grade(
         DataError: A recording cannot be read, or its truth is not known.
         FlowlabError: The folder cannot be written, or a library is missing.
     """
+    recordings, tasks = check_paths(recordings, "recordings"), check_names(tasks, "tasks")
+    trackers, settings = check_names(trackers, "trackers"), check_settings(settings, form=_SETTINGS_FORM)
+    episodes, seed, out = check_count(episodes, "episodes"), check_count(seed, "seed", 0), check_path(out, "out")
     if not recordings and not tasks:
         raise UsageError("nothing to grade; give folders with a ground_truth.npz, or --tasks hammer,door-open")
-    out = Path(out)
     made = [make_graded_tracker(name, trackers, settings, weights) for name in dict.fromkeys(trackers)]
-    folders = [folder for path in recordings for folder in find_with_truth(Path(path))]
+    folders = [folder for path in recordings for folder in find_with_truth(path)]
     simulated = None
     if tasks:
         more, simulated = _simulate(tasks, range(seed, seed + episodes), sensor, size, out, on_progress)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from flowlab.arguments import check_names, check_optional_count, check_path, check_settings
 from flowlab.engines.base import core_count
 from flowlab.errors import FlowlabError, MissingLibraryError, UsageError
 from flowlab.pipeline.filling import engine_for, fill
@@ -59,7 +60,7 @@ def extract(
         chosen,
         manifest_for(chosen, names),
         lambda _: plan,
-        Path(out),
+        check_path(out, "out"),
         start_engine=engine_for(chosen, engine, workers),
         share=JobShard.parse(shard) if isinstance(shard, str) else shard,
         report=on_progress or (lambda _: None),
@@ -113,7 +114,7 @@ def estimate(
             f"{request.task} seed {request.seed} is rejected at {rejected.stage} ({rejected}): no estimate"
         ) from rejected
     seconds = time.process_time() - start
-    workers = workers or core_count()
+    workers = check_optional_count(workers, "workers") or core_count()
     have = Counter(task for r in read_receipts(Path(out)) for task in [r.task] * len(r.accepted))
     todo = sum(max(chosen.episodes - have[t], 0) for t in names)
     episode_bytes = sum(v.nbytes for s in SCHEMA if s.per_step and (v := s.of(episode)) is not None)
@@ -151,9 +152,10 @@ def _prepare(
     _load_simulator()
     from flowlab.sim.tasks import GROUPS, select_tasks
 
-    changes = [*settings, *([f"episodes={episodes}"] if episodes is not None else [])]
+    episodes = check_optional_count(episodes, "episodes")
+    changes = [*check_settings(settings), *([f"episodes={episodes}"] if episodes is not None else [])]
     chosen = load_recipe(recipe, changes)
-    asked = [tasks] if isinstance(tasks, str) else list(tasks) or list(chosen.tasks)
+    asked = check_names(tasks, "tasks") or chosen.tasks
     names = select_tasks([t for t in asked if t not in GROUPS], [t for t in asked if t in GROUPS])
     if not names:
         raise UsageError("name the tasks to extract, as in 'flowlab extract-sim hammer push --out data/demo'")

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+from flowlab.arguments import check_path, check_paths, check_settings
 from flowlab.engines.base import StartEngine
 from flowlab.errors import UsageError
 from flowlab.pipeline.filling import engine_for, fill
@@ -63,8 +64,8 @@ def label(
     chosen = labeling_recipe(recipe, settings, tracker=tracker, calibration=calibration, weights=weights)
     return label_recordings(
         chosen,
-        find_jobs(chosen, [Path(paths)] if isinstance(paths, Path | str) else [Path(p) for p in paths], task),
-        Path(out),
+        find_jobs(chosen, check_paths(paths, "paths"), task),
+        check_path(out, "out"),
         start_engine=engine_for(chosen, engine, workers),
         share=JobShard.parse(shard) if isinstance(shard, str) else shard,
         report=on_progress or (lambda _: None),
@@ -82,7 +83,7 @@ def labeling_recipe(
     """The recipe that :func:`label` goes by, given its arguments."""
     short = {"track.tracker": tracker, "track.options.weights": weights, "recording.calibration": calibration}
     changes = [f"{key}={json.dumps(str(value))}" for key, value in short.items() if value is not None]
-    return load_recipe(recipe, [*settings, *changes])
+    return load_recipe(recipe, [*check_settings(settings), *changes])
 
 
 def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) -> tuple[Recorded, ...]:

@@ -256,6 +256,6 @@ def _validated(model: type[Model], path: Path) -> Model:
     except ValidationError as error:
         raise DataError(f"{path}: {explain(error, model)}") from error
     except UsageError as error:
-        raise DataError(
-            f"{path}: {error}; install what has this policy, or put its module's folder on PYTHONPATH"
-        ) from error
+        told = isinstance(error.__cause__, ModuleNotFoundError)  # where such a module may lie
+        advice = "" if told else "; install what has this policy, or put its module's folder on PYTHONPATH"
+        raise DataError(f"{path}: {error}{advice}") from error

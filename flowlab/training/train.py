@@ -7,14 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flowlab.arguments import check_count, check_minutes, check_names, check_optional_count, check_path, check_settings
+from flowlab.data.source import path_of
 from flowlab.policies.checkpoint import writing_run
 from flowlab.policies.profiles import load_settings
+from flowlab.storage.dataset import Dataset
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import METRICS, last_metrics
 from flowlab.training.run import ComputeSettings, Precision, prepare_run, resume_run, run
 from flowlab.training.trainer import Trainer, TrainingProgress
 
 CURVE = "curve.png"
+_SETTINGS_FORM = "a list of strings, as in settings=['batch.windows=64']"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,7 @@ class Watch:
 
 
 def train(
-    data: Path | str,
+    data: Dataset | Path | str,
     out: Path | str,
     *,
     policy: str = "fdp",
@@ -99,7 +103,7 @@ def train(
     Under ``torchrun`` every process calls this, and they share each batch.
 
     Args:
-        data: A dataset, or a store in DP3's layout.
+        data: A dataset, opened or its path, or a store in DP3's layout.
         out: Folder of the run, which must not hold one yet.
         policy: ``fdp``, ``dp3``, ``mba``, what an installed package offers, or ``module:Class``, whose module may lie
             in the current folder.
@@ -124,13 +128,16 @@ def train(
         DivergedError: The loss is no longer a number.
     """
     here = Path.cwd()
-    changes = [f"run.minutes={minutes}", "run.steps=null"] if minutes else []
+    minutes, seed = check_minutes(minutes), check_optional_count(seed, "seed", 0)
+    overfit, threads = check_optional_count(overfit, "overfit"), check_count(threads, "threads")
+    logs = check_names(logs, "logs")
+    changes = [f"run.minutes={minutes}", "run.steps=null"] if minutes is not None else []
     changes += [f"run.seed={seed}"] if seed is not None else []
-    chosen = load_settings(profile, policy, [*settings, *changes], here)
+    chosen = load_settings(profile, policy, [*check_settings(settings, form=_SETTINGS_FORM), *changes], here)
     check_loggers(tuple(logs), here)
     compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
-    began = None if began_from is None else Path(began_from)
-    trainer = prepare_run(Path(data), Path(out), chosen, compute, overfit=overfit, began_from=began)
+    began = None if began_from is None else check_path(began_from, "began_from")
+    trainer = prepare_run(path_of(data), check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
     return _run(trainer, watch)
 
 

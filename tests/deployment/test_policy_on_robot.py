@@ -363,3 +363,8 @@ def test_the_loop_that_is_documented_runs(run: Path, tmp_path: Path, monkeypatch
     exec(loop, {"camera": SimpleNamespace(frame=plate), "robot": robot})
     assert len(robot.sent) == 200
     assert all(action.shape == (4,) and np.isfinite(action).all() for action in robot.sent)
+
+
+def test_a_policy_is_told_apart_at_a_glance(run: Path) -> None:
+    assert repr(Policy.load(run)).startswith("Policy(fdp for ")
+    assert "\n" not in repr(Policy.load(run))

@@ -23,7 +23,7 @@ from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
 from flowlab.policies.checkpoint import RunConfig, TrainedPolicy, save_weights, start_folder
 from flowlab.records import Frame
-from flowlab.sim.recorder import TaskSimulator
+from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
 from flowlab.sim.simulation import CameraSettings, SceneSettings
 
 
@@ -129,3 +129,37 @@ def test_a_frame_without_color_is_refused_and_the_step_is_still_to_be_done() -> 
     np.testing.assert_array_equal(policy.act(Frame(depth, CAMERA, rgb=rgb), np.zeros(9)), [0, 0, 1, 0])
     assert policy.step == 1
     assert policy.warm_up() > 0
+
+
+class BlindSettings(PictureSettings):
+    """Of a policy that sees nothing but the state."""
+
+    policy: str = "test_color_policy:Blind"
+
+    @property
+    def needs(self) -> Needs:
+        return Needs()
+
+
+class Blind(Picture):
+    """Moves up, eyes shut."""
+
+    settings_class = BlindSettings
+
+
+def test_a_policy_that_needs_no_picture_wants_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither on a robot nor in simulation, where then none is rendered."""
+    network = Blind(spec().model_copy(update={"settings": BlindSettings()}))
+    policy = Policy(network, "reach")
+    for step in range(7):
+        assert not policy.wants_frame
+        state = np.full(9, step, np.float32)
+        np.testing.assert_array_equal(policy.act(None, state), [0, 0, 1, 0])
+    assert [shown.state[:, 0].tolist() for shown in network.shown] == [[0, 0], [2, 3], [5, 6]]
+
+    def rendered(recorder: EpisodeRecorder) -> Frame:
+        raise AssertionError("a frame was rendered")
+
+    monkeypatch.setattr(EpisodeRecorder, "frame", rendered)
+    (tried,) = roll_out(network, SimulatorPool("reach", scene()), [Trial("reach", 0, 0)], max_steps=4)
+    assert len(tried.rollout.action) == 4

@@ -127,7 +127,11 @@ SENTENCES = {
     "no stages": (yaml.safe_dump({"name": "a", "stages": None}), "must be a list of stages"),
     "not a mapping": ("- 1", "a recipe is a mapping with the keys name, description, tasks, "),
     "not YAML": ("name: [", "not valid YAML"),
-    "nothing to import": (recipe_of("expert", "no_such:Stage"), "cannot be imported (No module named 'no_such')"),
+    "nothing to import": (
+        recipe_of("expert", "no_such:Stage"),
+        "cannot be imported (No module named 'no_such'); install what has this stage, or put its module's folder on "
+        "PYTHONPATH, or its file beside the recipe that names it",
+    ),
     "nothing in the module": (recipe_of("expert", "json:Stage"), "cannot be imported (module 'json' has no attribute"),
     "not a stage": (recipe_of("expert", "json:JSONDecoder"), "is not a subclass of flowlab.pipeline.stage.Stage"),
     "missing write": (

@@ -1,0 +1,124 @@
+"""Arguments as people give them to Python functions: what fits is brought into one form, what does not is one sentence.
+
+The command line has its own checks of what is typed; these are the same limits for those who call a function.
+"""
+
+import math
+import os
+from collections.abc import Iterable, Mapping
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+from flowlab.errors import UsageError
+
+SETTINGS_FORM = "a list of strings, as in settings=['observer.points=512']"
+
+
+def check_settings(value: Any, name: str = "settings", form: str = SETTINGS_FORM) -> tuple[str, ...]:
+    """Strings, of which one alone is no list: it would be taken letter by letter.
+
+    Args:
+        value: What was given.
+        name: Of the argument.
+        form: What it should be, in words.
+
+    Returns:
+        The strings.
+
+    Raises:
+        UsageError: They are no strings, or one alone, or a mapping.
+    """
+    if (listed := _listed(value, str)) is None:
+        raise _wrong(name, value, form)
+    return listed
+
+
+def check_names(value: Any, name: str) -> tuple[str, ...]:
+    """Names, or one of them. Raises :class:`UsageError` for anything else."""
+    if isinstance(value, str):
+        return (value,)
+    if (listed := _listed(value, str)) is None:
+        raise _wrong(name, value, "a name or a list of names")
+    return listed
+
+
+def check_paths(value: Any, name: str) -> tuple[Path, ...]:
+    """Paths, or one of them. Raises :class:`UsageError` for anything else."""
+    if isinstance(value, str | os.PathLike):
+        return (Path(value),)
+    if (listed := _listed(value, str | os.PathLike)) is None:
+        raise _wrong(name, value, "a path or a list of paths")
+    return tuple(map(Path, listed))
+
+
+def check_path(value: Any, name: str) -> Path:
+    """One path. Raises :class:`UsageError` for anything else."""
+    if not isinstance(value, str | os.PathLike):
+        raise _wrong(name, value, "a path")
+    return Path(value)
+
+
+def check_count(value: Any, name: str, least: int | None = 1) -> int:
+    """A whole number, not less than a limit.
+
+    Args:
+        value: What was given.
+        name: Of the argument.
+        least: The limit; None where there is none here.
+
+    Returns:
+        The number.
+
+    Raises:
+        UsageError: It is none, or less.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral) or (least is not None and value < least):
+        raise _wrong(name, value, "a whole number" if least is None else f"a whole number from {least} on")
+    return int(value)
+
+
+def check_optional_count(value: Any, name: str, least: int = 1) -> int | None:
+    """The same, or None."""
+    return None if value is None else check_count(value, name, least)
+
+
+def check_counts(value: Any, name: str, least: int | None = 0) -> tuple[int, ...]:
+    """Whole numbers, or one of them. Raises :class:`UsageError` for anything else."""
+    if isinstance(value, Integral):
+        return (check_count(value, name, least),)
+    if (listed := _listed(value, Integral)) is None:
+        raise _wrong(name, value, f"a whole number or a list of them, as in {name}=(0, 1, 2)")
+    return tuple(check_count(v, name, least) for v in listed)
+
+
+def check_minutes(value: Any, name: str = "minutes") -> float | None:
+    """A time above 0, or None. Raises :class:`UsageError` for anything else."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not is_finite(value) or value <= 0:
+        raise _wrong(name, value, "a number above 0, or None")
+    return float(value)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number, NumPy's too."""
+    return isinstance(value, Integral)
+
+
+def is_finite(value: Any) -> bool:
+    """Whether it is a number, and neither infinite nor none."""
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def _listed(value: Any, kind: Any) -> tuple[Any, ...] | None:
+    """What can be gone through as a list; None where it cannot, or not all in it is of a kind."""
+    if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
+        return None
+    values = tuple(value)
+    return values if all(isinstance(v, kind) for v in values) else None
+
+
+def _wrong(name: str, found: Any, expected: str) -> UsageError:
+    shown = repr(found)
+    return UsageError(f"{name}: must be {expected}; found {shown if len(shown) <= 60 else type(found).__name__}")
