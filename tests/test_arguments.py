@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from synthetic import make_dataset, make_episode
 
@@ -75,11 +74,6 @@ def dataset(tmp_path: Path) -> flowlab.Dataset:
     return make_dataset(tmp_path / "d", [[make_episode(0), make_episode(1)]])
 
 
-def test_some_episodes_of_a_dataset_are_no_dataset(dataset: flowlab.Dataset) -> None:
-    with pytest.raises(flowlab.UsageError, match=r"these are 2 episodes of .*d, .*make one of their task"):
-        Windows(dataset.task("roll"), {"state": [0]})  # type: ignore[arg-type]
-
-
 UNCHECKED = """
 import flowlab
 view = flowlab.open_dataset("d").task("roll")
@@ -109,30 +103,3 @@ def test_an_open_dataset_can_be_trained_on(dataset: flowlab.Dataset, tmp_path: P
     with pytest.raises(flowlab.UsageError, match="no setting of fdp is called 'x'"):
         flowlab.train(dataset, tmp_path / "r", settings=["x=1"])
     assert len(Windows(dataset, {"state": [0]})) == 24
-
-
-@pytest.mark.parametrize(
-    ("index", "says"),
-    [("roll", r"'roll' is no number; those of a task are dataset\.task\('push'\)"), ([0, 1], r"dataset\[0\]")],
-)
-def test_an_episode_is_asked_for_by_number(dataset: flowlab.Dataset, index: Any, says: str) -> None:
-    with pytest.raises(flowlab.UsageError, match=says):
-        dataset[index]
-    assert dataset[np.int64(1)].seed == 1  # type: ignore[call-overload]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ({"offsets": ["action"]}, "say for every array which rows"),
-        ({"offsets": {}}, "say for every array which rows"),
-        ({"offsets": {"action": [0]}, "episodes": ["push"]}, "episodes: must be a whole number or a list of them"),
-        ({"delta_timestamps": {"action": ["a"]}}, "must be times"),
-        ({"delta_timestamps": {"action": [float("nan")]}}, "must be times"),
-    ],
-)
-def test_windows_say_what_is_wrong(dataset: flowlab.Dataset, arguments: dict[str, Any], says: str) -> None:
-    with pytest.raises(flowlab.UsageError, match=says):
-        Windows(dataset, **arguments)
-    with pytest.raises(flowlab.UsageError, match="one is asked for at a time"):
-        Windows(dataset, {"state": [0]})[2:4]  # type: ignore[index]
