@@ -26,18 +26,6 @@ class Renderer(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class _Relocated:
-    """The pictures of a renderer, as those of a camera whose pose is given in another frame."""
-
-    renderer: Renderer
-    camera: Camera
-
-    def frame(self, poses: Poses) -> Frame:
-        """The picture from the renderer's camera."""
-        return replace(self.renderer.frame(poses), camera=self.camera)
-
-
 class ExpertSettings(Settings):
     """How long an expert goes on."""
 
@@ -63,7 +51,12 @@ class Rollout(Demonstration):
 
     def frame(self, t: int) -> Frame:
         """The picture taken at step ``t``, before action ``t``."""
-        return self.renderer.frame(self.poses.at(t))
+        return _seen_by(self.camera, self.renderer.frame(self.poses.at(t)))
+
+
+def _seen_by(camera: Camera, frame: Frame) -> Frame:
+    """A renderer's frame with the camera's pose in the dataset's world, which may not be MuJoCo's."""
+    return frame if frame.camera is camera else replace(frame, camera=camera)
 
 
 class EpisodeRecorder:
@@ -74,7 +67,6 @@ class EpisodeRecorder:
         self.camera, self.T_world_sim = simulation.camera(), np.eye(4)
         if simulation.settings.convention == "dp3":
             self.camera, self.T_world_sim = dp3_camera(self.camera)
-            self.renderer = _Relocated(renderer, self.camera)
         self._poses: list[Poses] = []
         self._state: list[np.ndarray] = []
         self._action: list[np.ndarray] = []
@@ -83,7 +75,7 @@ class EpisodeRecorder:
 
     def frame(self) -> Frame:
         """The picture of this moment."""
-        return self.renderer.frame(self.simulation.poses())
+        return _seen_by(self.camera, self.renderer.frame(self.simulation.poses()))
 
     @property
     def unstable(self) -> bool:

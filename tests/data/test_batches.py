@@ -474,7 +474,8 @@ def test_queries_that_are_not_there_are_refused() -> None:
     many = "motion.points is 13, and the dataset has 12 query points; add --set motion.points=12, or make the dataset "
     with pytest.raises(DataError, match=many + "with --set queries.points=13"):
         choose_queries(buffer, motion("motion.points=13"))
-    none = replace(buffer, queries=np.zeros((3, 0, 3), np.float32))
+    nothing = {name: getattr(buffer, name)[:, :0] for name in ("tracks", "visible", "sigma", "queries", "query_role")}
+    none = replace(buffer, **nothing)
     with pytest.raises(DataError, match=r"the dataset has no query points, .*; train --policy dp3"):
         choose_queries(none, motion())
     buffer.query_role[1] = Role.ROBOT

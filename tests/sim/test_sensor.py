@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from thoroughness import examples
 
+from flowlab.config import SettingsError
 from flowlab.sim.sensor import CLEAN, KINECT, PRESETS, Sensor, SensorSettings
 
 HEIGHT, WIDTH = 240, 320
@@ -165,7 +166,7 @@ def test_readings_are_sane(near: float, far: float, seed: int) -> None:
 
 
 def test_settings_refuse_nonsense() -> None:
-    with pytest.raises(ValidationError):
+    with pytest.raises(SettingsError):
         SensorSettings(edge_holes=1.5)
     with pytest.raises(ValidationError):
         SensorSettings.model_validate({"edge_hole": 0.1})

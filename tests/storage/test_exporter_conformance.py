@@ -158,8 +158,8 @@ class Unguarded(Lengths):
 
     def export(self, dataset: Dataset, path: Path, task: str | None = None) -> int:
         chosen = select_episodes(dataset, path, task)
-        with new_folder(path) as folder:
-            self.write(dataset, folder, task)
+        path.mkdir(parents=True)
+        self.write(dataset, path, task)
         return len(chosen)
 
 
