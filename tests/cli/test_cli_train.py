@@ -115,7 +115,10 @@ def test_minutes_are_kept_to(rolls: Path, tmp_path: Path, capsys: Capture) -> No
     check_run(tmp_path / "run", final["step"], 2)
 
 
-@pytest.mark.parametrize("policy", ["fdp", "dp3", "mba"])
+_SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("policy", ["fdp", pytest.param("dp3", marks=_SLOW), pytest.param("mba", marks=_SLOW)])
 def test_one_demonstration_is_learned_by_heart(policy: str, rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     """Its actions are random numbers, so nothing but the demonstration tells them."""
     more = ("action.widths=[64,64]", "batch.draws=4", "batch.shift_m=0", "optimizer.learning_rate=1e-2")

@@ -34,7 +34,7 @@ KINDS: dict[str, tuple[type[PolicyNetwork], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["dp3", "fdp", pytest.param("mba", marks=pytest.mark.slow), "fdp of channels"])
 def test_policies_keep_their_promises(kind: str, check: Callable[..., None]) -> None:
     check(*KINDS[kind])
 
