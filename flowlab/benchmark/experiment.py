@@ -161,8 +161,8 @@ def _known_result(out: Path, unit: ExperimentUnit, recipe: ExperimentRecipe) -> 
 
 def _check_same(found: Mapping[str, Any], recipe: TrainSettings, where: Path) -> None:
     """Refuse to mix what was made with other settings."""
-    if lines := list(differences(found, json.loads(recipe.model_dump_json()), "settings")):
+    if lines := list(differences(found, json.loads(recipe.model_dump_json()), "settings", owners=("it", "the recipe"))):
         raise DataError(
             f"{where}: was made with other settings; choose another --out, or delete it to make it anew:\n  "
-            + "\n  ".join(line.replace("the dataset has", "it has").replace("this run", "the recipe") for line in lines)
+            + "\n  ".join(lines)
         )

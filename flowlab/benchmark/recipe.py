@@ -9,7 +9,7 @@ from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
 from flowlab.config import Settings, explain, read_named
 from flowlab.errors import UsageError, unknown_name
 from flowlab.evaluation.trials import Trial, list_trials
-from flowlab.sim.tasks import GROUPS, select_tasks
+from flowlab.sim.tasks import tasks_named
 
 
 class PolicyVariant(Settings):
@@ -82,7 +82,7 @@ def with_variants(recipe: ExperimentRecipe, names: Sequence[str]) -> ExperimentR
 
 def expand_tasks(names: Sequence[str]) -> tuple[str, ...]:
     """The tasks of a list of tasks and groups of them. Raises :class:`UsageError` where a name does not exist."""
-    return select_tasks([n for n in names if n not in GROUPS], [n for n in names if n in GROUPS])
+    return tasks_named(names)
 
 
 def curve_trials(recipe: ExperimentRecipe, task: str) -> list[Trial]:

@@ -1,6 +1,5 @@
 """A whole grading run: recordings found or simulated, labeled by some trackers, and compared with their truth."""
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,10 +9,11 @@ from typing import Any
 import yaml
 
 from flowlab.arguments import check_count, check_names, check_path, check_paths, check_settings
-from flowlab.errors import FlowlabError, MissingLibraryError, UsageError, unknown_name
+from flowlab.errors import FlowlabError, UsageError, unknown_name
 from flowlab.files import write_json
 from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_tracker
 from flowlab.grading.ground_truth import find_with_truth
+from flowlab.sim.loading import load_mujoco
 from flowlab.tracking.base import Tracker, make_tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.lifting import LiftSettings
@@ -140,13 +140,13 @@ def _simulate(
     on_progress: Callable[[str], None],
 ) -> tuple[list[Path], dict[str, Any]]:
     """Record what is not there yet; the folders of all, and how they are made."""
-    _import_mujoco()
+    load_mujoco()
     from flowlab.grading.simulate import SimulatedRecording, simulate_recording
-    from flowlab.sim.tasks import GROUPS, select_tasks
+    from flowlab.sim.tasks import tasks_named
 
     how = SimulatedRecording.with_camera(sensor, size)
     folders = []
-    for task in select_tasks([n for n in names if n not in GROUPS], [n for n in names if n in GROUPS]):
+    for task in tasks_named(names):
         for seed in seeds:
             folder = out / "recordings" / f"{task}-{seed}"
             with _writing(out):
@@ -156,23 +156,12 @@ def _simulate(
     return folders, how.model_dump(mode="json")
 
 
-def _import_mujoco() -> None:
-    """Import MuJoCo, which fails where it cannot load the OpenGL that is asked for."""
-    try:
-        import mujoco  # noqa: F401
-    except Exception as error:
-        if "MUJOCO_GL" not in os.environ:
-            raise
-        raise MissingLibraryError(
-            f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
-            "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
-        ) from error
-
-
 @contextmanager
 def _writing(out: Path) -> Iterator[None]:
     """Say where it was that something could not be written."""
     try:
         yield
+    except FlowlabError:  # that a file to be read is missing is an OSError, too
+        raise
     except OSError as error:
         raise FlowlabError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error

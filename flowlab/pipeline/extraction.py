@@ -1,6 +1,5 @@
 """Datasets of simulated demonstrations: make one, or say what that would take."""
 
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -9,12 +8,13 @@ from pathlib import Path
 
 from flowlab.arguments import check_names, check_optional_count, check_path, check_settings
 from flowlab.engines.base import core_count
-from flowlab.errors import FlowlabError, MissingLibraryError, UsageError
+from flowlab.errors import FlowlabError, UsageError
 from flowlab.pipeline.filling import engine_for, fill
 from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, SeedScheduler
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.units import JobShard
+from flowlab.sim.loading import load_mujoco
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import read_receipts
@@ -149,27 +149,14 @@ def _prepare(
     tasks: Iterable[str] | str, episodes: int | None, recipe: str | Recipe, settings: Iterable[str]
 ) -> tuple[Recipe, tuple[str, ...]]:
     """The recipe with its changes, and the names of the tasks."""
-    _load_simulator()
-    from flowlab.sim.tasks import GROUPS, select_tasks
+    load_mujoco()
+    from flowlab.sim.tasks import tasks_named
 
     episodes = check_optional_count(episodes, "episodes")
     changes = [*check_settings(settings), *([f"episodes={episodes}"] if episodes is not None else [])]
     chosen = load_recipe(recipe, changes)
     asked = check_names(tasks, "tasks") or chosen.tasks
-    names = select_tasks([t for t in asked if t not in GROUPS], [t for t in asked if t in GROUPS])
+    names = tasks_named(asked)
     if not names:
         raise UsageError("name the tasks to extract, as in 'flowlab extract-sim hammer push --out data/demo'")
     return chosen, names
-
-
-def _load_simulator() -> None:
-    """MuJoCo loads the OpenGL it is told of on import, needed or not; say so where that fails."""
-    try:
-        import flowlab.pipeline.stages.simulation  # noqa: F401
-    except Exception as error:
-        if "MUJOCO_GL" not in os.environ:
-            raise
-        raise MissingLibraryError(
-            f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
-            "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
-        ) from error

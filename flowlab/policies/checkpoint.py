@@ -151,12 +151,18 @@ def check_observer(trained: TrainedPolicy, where: Path, source: TrainingSource) 
     mine, theirs = trained.policy.observer, source.provenance.observer
     if mine is None and theirs is None:
         return
-    lines = list(differences(json.loads(json.dumps(theirs)), json.loads(json.dumps(mine)), "observer"))
+    lines = list(
+        differences(
+            json.loads(json.dumps(theirs)),
+            json.loads(json.dumps(mine)),
+            "observer",
+            owners=("the dataset", "the policy"),
+        )
+    )
     if lines:
         raise DataError(
             f"{source.path}: its point clouds were made with other settings than those that {where} was trained with; "
-            "make the dataset again with the policy's, or train a new policy:\n  "
-            + "\n  ".join(line.replace("this run has", "the policy has") for line in lines)
+            "make the dataset again with the policy's, or train a new policy:\n  " + "\n  ".join(lines)
         )
 
 

@@ -126,5 +126,7 @@ def _writing(path: Path) -> Iterator[None]:
     """Turns a failure to write a file into a sentence."""
     try:
         yield
+    except FlowlabError:  # that a file to be read is missing is an OSError, too
+        raise
     except OSError as error:
         raise FlowlabError(f"{path}: cannot be written ({error.strerror}); choose another file") from error

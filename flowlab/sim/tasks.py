@@ -65,6 +65,12 @@ def find_task(name: str) -> Task:
     return task
 
 
+def tasks_named(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of tasks for names of tasks and of groups: the tasks first, then those of the groups, each once."""
+    names = list(names)
+    return select_tasks([n for n in names if n not in GROUPS], [n for n in names if n in GROUPS])
+
+
 def select_tasks(names: Iterable[str], groups: Iterable[str]) -> tuple[str, ...]:
     """Names of the given tasks and groups, each once, in the order given."""
     chosen = [find_task(name).name for name in names]

@@ -75,10 +75,12 @@ class Manifest(Settings):
             raise DataError(f"{path}: field '{field}': {first['msg']}") from error
 
 
-def differences(old: Any, new: Any, where: str = "") -> Iterator[str]:
-    """One line for every setting in which two groups of settings differ."""
+def differences(
+    old: Any, new: Any, where: str = "", *, owners: tuple[str, str] = ("the dataset", "this run")
+) -> Iterator[str]:
+    """One line for every setting in which two groups differ; ``owners`` are what has the one, and what the other."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         for key in sorted({*old, *new}):
-            yield from differences(old.get(key), new.get(key), f"{where}.{key}".strip("."))
+            yield from differences(old.get(key), new.get(key), f"{where}.{key}".strip("."), owners=owners)
     elif old != new:
-        yield f"{where}: the dataset has {json.dumps(old)}, this run has {json.dumps(new)}"
+        yield f"{where}: {owners[0]} has {json.dumps(old)}, {owners[1]} has {json.dumps(new)}"
