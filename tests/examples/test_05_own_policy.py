@@ -71,6 +71,7 @@ def test_it_keeps_the_promises_of_a_policy(check: Callable[..., None], policy: t
     check(policy, SMALL)
 
 
+@pytest.mark.slow  # color pictures by llvmpipe, episode after episode; tests/evaluation/test_color_policy.py has one
 def test_it_is_evaluated_in_simulation(run: Path) -> None:
     done = flowlab("eval", run, "--episodes", 2, "--seeds", 0, "--workers", 1, "--json")
     assert done.returncode == 0, done.stderr

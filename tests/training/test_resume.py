@@ -102,7 +102,11 @@ def check_same(resumed: Path, unbroken: Path) -> None:
     assert leftovers(resumed) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],  # handled as SIGINT is
+    ids=lambda n: n.name,
+)
 def test_a_run_goes_on_as_if_it_had_never_stopped(
     number: signal.Signals, rolls: Path, precision: list[str], unbroken: Path, tmp_path: Path, capsys: Capture
 ) -> None:
