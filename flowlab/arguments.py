@@ -96,19 +96,9 @@ def check_minutes(value: Any, name: str = "minutes") -> float | None:
     """A time above 0, or None. Raises :class:`UsageError` for anything else."""
     if value is None:
         return None
-    if isinstance(value, bool) or not is_finite(value) or value <= 0:
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < math.inf:
         raise _wrong(name, value, "a number above 0, or None")
     return float(value)
-
-
-def is_whole(value: Any) -> bool:
-    """Whether it is a whole number, NumPy's too."""
-    return isinstance(value, Integral)
-
-
-def is_finite(value: Any) -> bool:
-    """Whether it is a number, and neither infinite nor none."""
-    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _listed(value: Any, kind: Any) -> tuple[Any, ...] | None:
