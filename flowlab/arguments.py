@@ -96,7 +96,7 @@ def check_minutes(value: Any, name: str = "minutes") -> float | None:
     """A time above 0, or None. Raises :class:`UsageError` for anything else."""
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < math.inf:
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < math.inf:
         raise _wrong(name, value, "a number above 0, or None")
     return float(value)
 
