@@ -39,31 +39,18 @@ def check_frame(frame: Frame) -> Frame:
     """The frame, laid out in memory as the Observer's code was compiled for: else it would be, again, now.
 
     Raises:
-        UsageError: Depth, color and camera do not fit each other, or depth is not in meters.
+        UsageError: It is no frame. That a frame's parts fit each other, the record has seen to.
     """
     if not isinstance(frame, Frame):
         raise UsageError(
             f"observation is {type(frame).__name__}, expected a Frame; give flowlab.Frame(depth, camera), with "
             "rgb=picture for policies on color"
         )
-    depth, camera = np.asarray(frame.depth), frame.camera
-    size = camera.height, camera.width
-    if depth.shape != size:
-        raise UsageError(
-            f"depth has the shape {depth.shape}, and its camera has {camera.height} rows and {camera.width} columns; "
-            "give the camera of this very picture"
-        )
-    if depth.dtype.kind != "f":
-        raise UsageError(
-            f"depth is {depth.dtype}; give meters as float32, of millimeters (depth / 1000).astype(np.float32)"
-        )
-    for name, shape in (("K", (3, 3)), ("T_world_cam", (4, 4))):
-        if np.shape(getattr(camera, name)) != shape:
-            raise UsageError(f"camera.{name} has the shape {np.shape(getattr(camera, name))}, expected {shape}")
+    camera = frame.camera
     plain = replace(
         camera, K=_contiguous(camera.K, np.float64), T_world_cam=_contiguous(camera.T_world_cam, np.float64)
     )
-    return replace(frame, depth=_contiguous(depth, np.float32), camera=plain)
+    return replace(frame, depth=_contiguous(frame.depth, np.float32), camera=plain)
 
 
 def explain_empty_cloud(frame: Frame, workspace: Box) -> str:
