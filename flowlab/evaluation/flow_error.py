@@ -8,11 +8,11 @@ from jaxtyping import Float, Float32
 
 from flowlab.evaluation.results import RolloutFlowError
 from flowlab.geometry.camera import Camera
+from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.grading.tapvid import tapvid
 from flowlab.records import Queries
 from flowlab.sim.exact_tracks import RigidFlowSettings, rigid_tracks
 from flowlab.sim.recorder import Rollout
-from flowlab.training.validation import MOVING_M
 
 _DIGITS = 4
 """After the point, of what is kept."""
@@ -94,7 +94,7 @@ def _errors_of_plan(
     on."""
     true = tracks_world[1:] - tracks_world[0]
     distance = np.stack([np.linalg.norm(d, axis=-1) for d in (flow[: len(true)].cumsum(0) - true, true)])
-    moves = (distance[1] > MOVING_M).any(0)
+    moves = (distance[1] > MOVING_IN_PLAN_M).any(0)
     return PlanErrors(
         moving=distance[:, :, moves].reshape(2, -1),
         last=distance[:, -1, moves],

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from flowlab.geometry.camera import Camera
+from flowlab.geometry.moving import MOVING_IN_RECORDING_M
 from flowlab.grading.calibration import Calibration, calibrate
 from flowlab.grading.ground_truth import GroundTruth
 from flowlab.grading.tapvid import MetricSettings, TapVid3D, tapvid
@@ -17,8 +18,6 @@ CURVE_MM = tuple(float(x) for x in np.geomspace(0.5, 500, 61))
 """Error limits of the cumulative curves."""
 MOVED_M = 0.01
 """A point has moved, at one instant, if it is farther than this from its start."""
-MOVING_M = 0.02
-"""Only points that get farther than this from their start, at some instant, count as moving."""
 LOST_M = 0.05
 """A point is lost at the first visible instant with a larger error."""
 
@@ -123,7 +122,7 @@ def _motion(truth: GroundTruth) -> tuple[Bool[np.ndarray, "N"], Bool[np.ndarray,
     if truth.role is None:
         return np.zeros(truth.visible.shape[1], bool), np.zeros(truth.visible.shape, bool)
     away = np.linalg.norm(truth.tracks_cam.astype(np.float64) - truth.tracks_cam[:1], axis=-1)
-    moving = away.max(0) > MOVING_M
+    moving = away.max(0) > MOVING_IN_RECORDING_M
     return moving, moving & (away > MOVED_M)
 
 

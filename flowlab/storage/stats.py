@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from flowlab.geometry.moving import MOVING_IN_EPISODE_M, STILL_STEP_M
 from flowlab.records import Episode, PositionSource, Quality
 
-STILL = 1e-4
-"""A query point that moves less than this in one step [m] counts as still."""
 _BINS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241), [np.inf]])
 """Bins of step lengths [m], 40 to a decade: quantiles read off them are right to 6 %."""
 _CHANNELS: dict[str, Callable[[Episode], np.ndarray | None]] = {
@@ -63,7 +62,7 @@ def describe(summary: Summary) -> dict[str, Any]:
         for name, m in sorted(summary["arrays"].items())
     }
     steps = np.array(summary["steps"])
-    still = int(steps[_BINS[1:] <= STILL].sum())
+    still = int(steps[_BINS[1:] <= STILL_STEP_M].sum())
     motion = {
         "still_share": still / max(int(steps.sum()), 1),
         "moving_point_share": summary["moving_points"] / max(summary["points"], 1),
@@ -82,7 +81,7 @@ def _of_episode(e: Episode) -> Summary:
         "episodes": 1,
         "frames": len(e),
         "points": traveled.size,
-        "moving_points": int((traveled > 0.01).sum()),
+        "moving_points": int((traveled > MOVING_IN_EPISODE_M).sum()),
         "steps": np.histogram(step, _BINS)[0].tolist(),
         "arrays": {name: _moments(a) for name, a in arrays.items() if a is not None and a.size},
     }

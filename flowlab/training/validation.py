@@ -9,10 +9,9 @@ from torch import Tensor
 from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.batches import Batch
 from flowlab.data.window_sampler import WindowIndex
+from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.policies.base import ActionPlan, PolicyNetwork
 
-MOVING_M = 0.005
-"""A query point, or object, that gets farther than this from where it is now [m] within a window counts as moving."""
 _WINDOWS = 256
 """Most windows that are looked at, evenly spaced over all of them."""
 _AT_ONCE = 64
@@ -72,7 +71,7 @@ def true_motion(batch: Batch, now: int) -> tuple[Tensor, Tensor, Tensor]:
     (W, K, M); and which points move (W, 1, M)."""
     known = (batch.flow_weight[:, now:] > 0).cummin(1).values
     true = batch.flow[:, now:].cumsum(1)
-    return true, known, ((true.norm(dim=-1) > MOVING_M) & known).any(1, keepdim=True)
+    return true, known, ((true.norm(dim=-1) > MOVING_IN_PLAN_M) & known).any(1, keepdim=True)
 
 
 def constant_motion(batch: Batch, now: int) -> Tensor:

@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from flowlab.geometry.moving import MOVING_IN_EPISODE_M
 from flowlab.records import Episode, PositionSource, Role
 from flowlab.viz.colors import SIGMA_LIMIT
-
-MOVING_M = 0.01
-"""A query point moves if it ever gets this far from where it was first [m], beyond what its stated errors allow."""
 
 
 def caption(episode: Episode, shown: int) -> str:
@@ -94,12 +92,12 @@ def _describe_quality(episode: Episode) -> dict[str, str]:
 
 
 def moving(episode: Episode) -> Bool[np.ndarray, "M"]:
-    """Which distinct query points ever get :data:`MOVING_M` away from where they were first; of estimated
+    """Which distinct query points ever get :data:`MOVING_IN_EPISODE_M` away from where they were first; of estimated
     tracks, beyond twice their stated errors."""
     quality, count = episode.tracks.quality, episode.queries.count
     xyz_world = episode.tracks.xyz_world[:, :count]
     doubt = 0.0 if quality is None else 2 * np.hypot(quality.sigma[:, :count], quality.sigma[0, :count])
-    far: np.ndarray = (np.linalg.norm(xyz_world - xyz_world[0], axis=-1) - doubt).max(0) > MOVING_M
+    far: np.ndarray = (np.linalg.norm(xyz_world - xyz_world[0], axis=-1) - doubt).max(0) > MOVING_IN_EPISODE_M
     return far
 
 

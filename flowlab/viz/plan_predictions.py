@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.records import Episode, FlowPrediction, Role
 
 PREDICTED_M = 0.002
 """A path is drawn if its point is predicted to get this far from where it was [m]."""
-MOVING_M = 0.005
-"""A point truly moves under a plan if it gets this far from where it was while the plan is executed [m]; as in
-evaluations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +33,7 @@ class PlanPrediction:
     @property
     def moving(self) -> Bool[np.ndarray, "M"]:
         """Which points did move."""
-        far: np.ndarray = _farthest(self.true_world) > MOVING_M
+        far: np.ndarray = _farthest(self.true_world) > MOVING_IN_PLAN_M
         return far
 
     @property

@@ -10,13 +10,14 @@ import rerun as rr
 from jaxtyping import Bool, UInt8
 
 from flowlab.files import temporary_path
+from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode, FlowPrediction
 from flowlab.viz.blueprint import CAMERA, DEPTH, RGB, make_blueprint, scene_size
 from flowlab.viz.captions import describe
 from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
 from flowlab.viz.orientation import world_is_camera_frame
-from flowlab.viz.plan_predictions import MOVING_M, PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
+from flowlab.viz.plan_predictions import PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
 
 TRAIL_STEPS = 20
 """A trail shows where a point was over this many steps."""
@@ -28,7 +29,7 @@ _LEGEND = (
     "The bright yellow lines, which end in dots, are where the policy predicted the points to go when it made its last "
     f"plan, step by step; points predicted to stay within {1000 * PREDICTED_M:.0f} mm have none. The flow error is how "
     "far from there the points truly were at each step, on average over those that move more than "
-    f"{1000 * MOVING_M:.0f} mm under the plan."
+    f"{1000 * MOVING_IN_PLAN_M:.0f} mm under the plan."
 )
 
 
