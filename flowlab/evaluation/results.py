@@ -11,8 +11,8 @@ class RolloutFlowError(Settings):
     """Predicted flow against where the query points really went while the actions were executed.
 
     Of an episode, over its plans; a point is where it truly was when the plan was made. ``zero`` predicts that nothing
-    moves. A point moves if it gets farther than :data:`flowlab.geometry.moving.MOVING_IN_PLAN_M` during the executed part
-    of a plan.
+    moves. A point moves if it gets farther than :data:`~flowlab.geometry.moving.MOVING_IN_PLAN_M` while the executed
+    part of a plan lasts.
     """
 
     pairs: int
