@@ -308,12 +308,25 @@ from flowlab.storage.shard import write_shard
 
 folder, rounds, over = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "over"
 rng = random.Random(0)
+write_bytes = Path.write_bytes
+
+def die_at_file(number):
+    left = [number]
+    def write(path, content):
+        left[0] -= 1
+        if not left[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return write_bytes(path, content)
+    Path.write_bytes = write
+
 old, new = (make_episode(k, steps=300) for k in (1, 2))
 for name in ["../warm", *(range(rounds) if over else ())]:
     write_shard(folder / f"{name}.zarr", [old], "")
 for k in range(rounds):
     pid = os.fork()
     if not pid:
+        if k % 4 == 0:  # at a file of its own, so that some are hit as they write on the busiest machine
+            die_at_file(1 + 2 * k)
         write_shard(folder / f"{k}.zarr", [new], "")
         os._exit(0)
     while not (begun := any(str(pid) in name for name in os.listdir(folder))):
