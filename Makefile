@@ -13,7 +13,7 @@ demo: .venv/run .venv/opengl ## a policy from nothing in minutes, and labels fro
 	$(BIN)/python tools/demo
 
 test: .venv/test ## the tests, below 8 minutes on 2 cores
-	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile
 
 test-all: .venv/test ## the tests, and the slow ones: all 50 tasks, other tools' readers
 	FLOWLAB_TESTS=all $(BIN)/pytest -n 2 --dist loadfile
