@@ -34,7 +34,7 @@ from careful_user import reset
 from extract import machine, print_rows
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.deployment.runner import PolicyRunner
+from flowlab.deployment.policy_runner import PolicyRunner
 from flowlab.evaluation import rollout
 from flowlab.evaluation.rollout import MAX_STEPS, SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial, list_trials
@@ -46,7 +46,8 @@ from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import LoadedPolicy, load_policy
 from flowlab.policies.profiles import load_settings
 from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
-from flowlab.sim.simulation import SceneSettings, Simulation
+from flowlab.sim.scene_settings import SceneSettings
+from flowlab.sim.simulation import Simulation
 from flowlab.training.run import ComputeSettings, prepare_run, run
 
 OURS, SHADED, DEPTH = "flowlab", "DP3's runner", "DP3's runner, depth only"

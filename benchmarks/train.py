@@ -26,8 +26,8 @@ from flowlab.evaluation.trials import list_trials
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.policies.profiles import load_settings
-from flowlab.sim.simulation import SceneSettings
-from flowlab.training.distributed import has_bf16
+from flowlab.sim.scene_settings import SceneSettings
+from flowlab.training.precision import has_bf16
 from flowlab.training.run import ComputeSettings, prepare_run, run
 from flowlab.training.trainer import Trainer
 

@@ -16,7 +16,7 @@ import numpy as np
 from flowlab import Policy
 from flowlab.records import Frame
 from flowlab.sim.recorder import TaskSimulator
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 STEPS = 200
 

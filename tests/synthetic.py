@@ -98,7 +98,7 @@ def make_provenance(settings: Mapping[str, Any] = SETTINGS, **changes: Any) -> P
     if "track" in settings:
         values |= {"tracks": "estimated", "tracker": settings["track"].get("tracker", "rigid-bodies")}
     if "expert" in settings:
-        from flowlab.sim.simulation import SceneSettings, describe_scene
+        from flowlab.sim.scene_settings import SceneSettings, describe_scene
 
         values |= describe_scene(SceneSettings.model_validate(settings["expert"].get("scene", {})))
     return Provenance(**{**values, **changes})

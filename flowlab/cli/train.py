@@ -12,7 +12,7 @@ from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
 if TYPE_CHECKING:
-    from flowlab.training.run import Precision
+    from flowlab.training.precision import Precision
     from flowlab.training.train import TrainedRun
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32
 
 from flowlab.arguments import check_count, check_optional_count, check_path
 from flowlab.deployment.inputs import check_frame, check_state, explain_empty_cloud, made_up_frame
-from flowlab.deployment.runner import PolicyRunner
+from flowlab.deployment.policy_runner import PolicyRunner
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.policies.base import PolicyNetwork

@@ -9,7 +9,7 @@ from flowlab.evaluation.episode_log import EPISODES, read_results
 from flowlab.evaluation.results import CheckpointEvaluation
 from flowlab.evaluation.trials import Trial
 from flowlab.policies.checkpoint import CHECKPOINTS, TrainedPolicy, newest_checkpoint, read_trained, step_of
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 FOLDER = "evaluation"
 """Of a run: holds a folder for every checkpoint and number of executed steps."""

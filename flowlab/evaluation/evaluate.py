@@ -18,7 +18,7 @@ from flowlab.evaluation.training_record import describe_run
 from flowlab.evaluation.trials import Trial, check_unseen, list_trials
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 _LARGEST_BATCH = 40
 """Episodes given to a worker at a time: few enough that progress shows."""

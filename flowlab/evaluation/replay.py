@@ -11,13 +11,14 @@ from flowlab.evaluation.results import EpisodeResult
 from flowlab.evaluation.rollout import PolicyRollout, SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.perception.queries import QuerySettings, queries_in
-from flowlab.pipeline.stages.shared import ObserverStage, labeled
+from flowlab.pipeline.stages.labeled import labeled
+from flowlab.pipeline.stages.observe import ObserverStage
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
 from flowlab.records import Episode, FlowPrediction, ObservedDemo, QueriedDemo, Queries
 from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 _TALLEST_PX = 480
 """MetaWorld's models let OpenGL draw no more rows than this."""

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float32
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.deployment.runner import PolicyRunner
+from flowlab.deployment.policy_runner import PolicyRunner
 from flowlab.errors import DataError
 from flowlab.evaluation.flow_error import flow_error
 from flowlab.evaluation.results import EpisodeResult
@@ -18,7 +18,7 @@ from flowlab.evaluation.trials import Trial
 from flowlab.policies.base import ActionPlan, PolicyNetwork
 from flowlab.records import Queries
 from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
-from flowlab.sim.simulation import ACTION_SIZE, SceneSettings
+from flowlab.sim.scene_settings import ACTION_SIZE, SceneSettings
 
 MAX_STEPS = 200
 """DP3's and 3D FDP's limit."""

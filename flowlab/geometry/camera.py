@@ -8,6 +8,8 @@ from jaxtyping import Float, Num
 
 from flowlab.shapes import Record, Size
 
+GL_TO_CV = np.diag([1.0, -1.0, -1.0])
+"""OpenGL's cameras, and MuJoCo's, look along -z with y up."""
 _ROTATION_TOLERANCE = 1e-3
 """So much may a rotation times its transpose differ from the identity: what rounding to three digits does."""
 

@@ -20,8 +20,8 @@ from flowlab.pipeline.stages.simulation import ExpertStage
 from flowlab.recordings.writing import write_rgbd_recording
 from flowlab.records import Frame, Role
 from flowlab.sim.pixel_tracks import surface_tracks
+from flowlab.sim.scene_settings import CameraSettings, SceneSettings
 from flowlab.sim.sensor import KINECT, PRESETS, Sensor, SensorSettings
-from flowlab.sim.simulation import CameraSettings, SceneSettings
 
 UNUSABLE_M = 0.005
 """A query whose sensor depth in the first frame is farther than this from the true surface is not graded:

@@ -13,9 +13,12 @@ from flowlab.errors import DataError, UsageError
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import pose_9d, rigid
 from flowlab.records import Demonstration, Frame
+from flowlab.sim.dp3_camera import dp3_camera
+from flowlab.sim.expert import Expert
 from flowlab.sim.render.zbuffer import PackedScene, ZBuffer
 from flowlab.sim.scene import Poses, Scene
-from flowlab.sim.simulation import SceneSettings, Simulation, dp3_camera
+from flowlab.sim.scene_settings import SceneSettings
+from flowlab.sim.simulation import Simulation
 
 
 class Renderer(Protocol):
@@ -146,7 +149,7 @@ class TaskSimulator:
         Raises :class:`DataError` where the physics becomes unstable.
         """
         live = self.begin(seed)
-        expert = self.simulation.expert()
+        expert = Expert(self.simulation)
         while len(live.success) < settings.max_steps:
             live.step(expert.act())
             if settings.stop == "success" and sum(live.success) >= settings.hold:

@@ -3,9 +3,7 @@
 import ctypes
 import os
 import warnings
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
-from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
@@ -13,6 +11,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from flowlab.errors import UsageError
 from flowlab.policies.base import PolicyNetwork
+from flowlab.training.precision import choose_precision
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Of ``malloc.h``."""
@@ -39,11 +38,7 @@ class ProcessGroup:
         if device == "cuda":
             device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
         self.device = torch.device(device)
-        if precision == "auto":
-            precision = "bf16" if has_bf16(self.device) else "fp32"
-        if precision == "bf16" and not has_bf16(self.device):
-            raise UsageError(f"--precision bf16: {self.device} has no units for it, and would be slower; use fp32")
-        self.precision = precision
+        self.precision = choose_precision(precision, self.device)
         torch.set_num_threads(threads)
         _reuse_freed_memory()
         if self.count > 1 and not distributed.is_initialized():
@@ -113,14 +108,6 @@ class ProcessGroup:
         """Leave the group."""
         if self.count > 1:
             distributed.destroy_process_group()
-
-
-def has_bf16(device: torch.device) -> bool:
-    """Whether a device multiplies matrices faster in bf16: two to four times, where it can at all."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    capabilities: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch has none
-    return bool(capabilities().get("avx512_bf16"))
 
 
 def _reuse_freed_memory() -> None:

@@ -4,7 +4,7 @@ import copy
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,11 +33,11 @@ from flowlab.registry import POLICIES
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.loggers import check_loggers, make_logger
 from flowlab.training.metrics import MetricsFile
+from flowlab.training.precision import Precision
 from flowlab.training.trainer import Trainer, TrainingProgress
 
 _UNTIMED, _TIMED = 3, 12
 """Steps made to learn how long one takes."""
-Precision = Literal["auto", "fp32", "bf16"]
 
 
 class ComputeSettings(Settings):

@@ -14,7 +14,8 @@ from flowlab.policies.profiles import load_settings
 from flowlab.storage.dataset import Dataset
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import METRICS, last_metrics
-from flowlab.training.run import ComputeSettings, Precision, prepare_run, resume_run, run
+from flowlab.training.precision import Precision
+from flowlab.training.run import ComputeSettings, prepare_run, resume_run, run
 from flowlab.training.trainer import Trainer, TrainingProgress
 
 CURVE = "curve.png"

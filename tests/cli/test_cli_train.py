@@ -27,7 +27,7 @@ from trained_runs import (
 
 from flowlab.storage.dataset import begin
 from flowlab.storage.recorded import Recorded
-from flowlab.training import distributed
+from flowlab.training import precision
 
 Capture = pytest.CaptureFixture[str]
 KEPT = ["policy.json", "run.json", "metrics.jsonl", "curve.png", "resume.safetensors"]
@@ -370,7 +370,7 @@ def test_bf16_is_refused_where_it_would_be_slower(
     rolls: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
 
-    monkeypatch.setattr(distributed, "has_bf16", lambda device: False)
+    monkeypatch.setattr(precision, "has_bf16", lambda device: False)
     small = ("train", rolls, "--policy", "dp3", *SMALL, "--device", "cpu")
     code, out, err = call_cli(capsys, *small, "--out", tmp_path / "a", "--precision", "bf16")
     assert (code, out) == (2, "")

@@ -27,7 +27,7 @@ from flowlab.policies.checkpoint import load_policy
 from flowlab.policies.dp3 import DP3
 from flowlab.policies.fdp import FDP
 from flowlab.records import Frame
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 TRIAL, STEPS = Trial("hammer", 0, 2), 20
 

@@ -24,7 +24,7 @@ from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork,
 from flowlab.policies.checkpoint import RunConfig, TrainedPolicy, save_weights, start_folder
 from flowlab.records import Frame
 from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
-from flowlab.sim.simulation import CameraSettings, SceneSettings
+from flowlab.sim.scene_settings import CameraSettings, SceneSettings
 
 
 class PictureSettings(TrainSettings):

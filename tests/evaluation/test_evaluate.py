@@ -21,7 +21,7 @@ from flowlab.cli import main
 from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.policies.checkpoint import load_policy
-from flowlab.sim.simulation import CameraSettings, SceneSettings
+from flowlab.sim.scene_settings import CameraSettings, SceneSettings
 
 Capture = pytest.CaptureFixture[str]
 TASK = "drawer-open"

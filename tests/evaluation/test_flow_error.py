@@ -15,8 +15,9 @@ from flowlab.geometry.transforms import apply, rigid
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, sample_queries
 from flowlab.records import Queries
+from flowlab.sim.expert import Expert
 from flowlab.sim.recorder import Rollout, TaskSimulator
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 PLANNED, MOVES_M = 15, 0.005
 Predicted = list[tuple[int, np.ndarray]]
@@ -40,7 +41,7 @@ def case() -> Case:
     recorder = simulator.begin(1_000_000)
     cloud = Observer(ObserverSettings(), "hammer").cloud(recorder.frame())
     queries = sample_queries(cloud, QuerySettings(points=12, sampling="stratified", object_share=0.5))
-    model, data, expert = simulation.model, simulation.data, simulation.expert()
+    model, data, expert = simulation.model, simulation.data, Expert(simulation)
     position, turn = [], []
     for _ in range(45):
         position.append(data.xpos.copy())

@@ -20,7 +20,7 @@ from flowlab.policies.dp3 import DP3
 from flowlab.policies.fdp import FDP
 from flowlab.records import Episode, Frame
 from flowlab.sim.recorder import EpisodeRecorder, ExpertSettings, TaskSimulator
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 HORIZON = 64
 

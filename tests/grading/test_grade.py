@@ -26,8 +26,8 @@ from flowlab.perception.observer import Box, ObserverSettings
 from flowlab.pipeline.stages.simulation import ExpertStage
 from flowlab.recordings.writing import write_rgbd_recording
 from flowlab.records import Clip, Quality, Role, Tracks2D, Tracks3D
+from flowlab.sim.scene_settings import CameraSettings, SceneSettings
 from flowlab.sim.sensor import CLEAN, KINECT
-from flowlab.sim.simulation import CameraSettings, SceneSettings
 from flowlab.tracking.base import Session, Tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.lifting import LiftSettings

@@ -16,8 +16,10 @@ from flowlab.perception.observer import Box
 from flowlab.perception.queries import EdgeSettings
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.stage import EpisodeRequest, Pipeline, Rejected, Stage, StageTally, Writer
-from flowlab.pipeline.stages.shared import AcceptStage, ObserverStage, QueriesStage, WriteStage
+from flowlab.pipeline.stages.accept import AcceptStage
+from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage
 from flowlab.pipeline.stages.simulation import ExpertStage, RigidFlowStage
+from flowlab.pipeline.stages.write import WriteStage
 from flowlab.pipeline.units import WorkUnit
 from flowlab.pipeline.worker import run_unit
 from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo

@@ -8,7 +8,8 @@ import pytest
 from synthetic import call_cli, files_below
 
 from flowlab.pipeline.recipe import load_recipe
-from flowlab.sim.simulation import SceneSettings, Simulation
+from flowlab.sim.scene_settings import SceneSettings
+from flowlab.sim.simulation import Simulation
 from flowlab.storage.dataset import Dataset
 
 OWN_EXPERT = '''

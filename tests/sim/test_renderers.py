@@ -19,10 +19,12 @@ from scipy.spatial.transform import Rotation
 from flowlab.errors import FlowlabError, MissingLibraryError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Frame, Role
+from flowlab.sim.expert import Expert
 from flowlab.sim.render.gl import GLRenderer
 from flowlab.sim.render.zbuffer import PackedScene, ZBuffer
 from flowlab.sim.scene import Poses, Scene
-from flowlab.sim.simulation import SceneSettings, Simulation
+from flowlab.sim.scene_settings import SceneSettings
+from flowlab.sim.simulation import Simulation
 
 WIDTH, HEIGHT = 48, 36
 DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
@@ -297,7 +299,7 @@ def midway(request: pytest.FixtureRequest) -> Simulation:
 def played(task: str, steps: int, **settings: Any) -> Simulation:
     simulation = Simulation(task, SceneSettings(**settings))
     simulation.reset(1)
-    expert = simulation.expert()
+    expert = Expert(simulation)
     for _ in range(steps):
         simulation.step(expert.act())
     return simulation
@@ -338,7 +340,7 @@ def gl_renderer(simulation: Simulation) -> GLRenderer:
 
 def gl_frames(simulation: Simulation, steps: int = 40) -> Iterator[tuple[Frame, Frame]]:
     """The z-buffer's picture and OpenGL's, at the first step and at a later one."""
-    gl, simulation_expert = gl_renderer(simulation), simulation.expert()
+    gl, simulation_expert = gl_renderer(simulation), Expert(simulation)
     try:
         yield zbuffer(simulation), gl.frame(simulation.poses())
         for _ in range(steps):
@@ -385,7 +387,7 @@ HIDDEN = {"RetainingWall", "hand"}
 SCRIPT = """
 import sys
 from flowlab.errors import MissingLibraryError
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 from flowlab.sim.recorder import ExpertSettings, TaskSimulator
 studio = TaskSimulator("reach", SceneSettings(renderer="gl"))
 try:

@@ -16,9 +16,11 @@ import pytest
 from metaworld import policies
 
 from flowlab.errors import FlowlabError
+from flowlab.sim.expert import Expert
 from flowlab.sim.recorder import ExpertSettings, Rollout, TaskSimulator
 from flowlab.sim.scene import Poses
-from flowlab.sim.simulation import CameraSettings, SceneSettings, Simulation
+from flowlab.sim.scene_settings import CameraSettings, SceneSettings
+from flowlab.sim.simulation import Simulation
 from flowlab.sim.tasks import TASKS
 
 LEAKY = ["box-close", "dial-turn", "drawer-open", "faucet-open"]
@@ -28,7 +30,7 @@ LEAKY = ["box-close", "dial-turn", "drawer-open", "faucet-open"]
 def digest(simulation: Simulation, seed: int, steps: int = 40) -> str:
     """Hash of every joint position and action of an expert's first steps."""
     simulation.reset(seed)
-    expert, found = simulation.expert(), hashlib.sha256(simulation.rand_vec.tobytes())
+    expert, found = Expert(simulation), hashlib.sha256(simulation.rand_vec.tobytes())
     for _ in range(steps):
         found.update(simulation.data.qpos.tobytes())
         action = expert.act()
@@ -130,7 +132,7 @@ def test_even_the_frozen_layout_is_stale_without_the_refresh(task: str) -> None:
 def test_refreshing_the_poses_does_not_disturb_the_trajectory(task: str) -> None:
     simulation = Simulation(task, SceneSettings())
     simulation.reset(2)
-    env, expert = metaworld_env(task), simulation.expert()
+    env, expert = metaworld_env(task), Expert(simulation)
     observation = lay_out(env, simulation.rand_vec)
     policy = getattr(policies, TASKS[task].expert)()
     for _ in range(50):
@@ -161,9 +163,9 @@ def test_the_expert_wants_more_than_it_may_so_clipping_matters() -> None:
     policy = getattr(policies, TASKS["hammer"].expert)()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        wanted = policy.get_action(simulation._observation)
+        wanted = policy.get_action(simulation.observation)
     assert np.abs(wanted).max() > 1
-    np.testing.assert_array_equal(simulation.expert().act(), np.clip(wanted, -1, 1).astype(np.float32))
+    np.testing.assert_array_equal(Expert(simulation).act(), np.clip(wanted, -1, 1).astype(np.float32))
 
 
 def test_recording_leaves_no_warnings_to_the_user() -> None:
@@ -266,7 +268,7 @@ if __name__ == "__main__":
 def test_what_the_fingers_hold_is_what_metaworld_says(task: str) -> None:
     simulation = Simulation(task, SceneSettings())
     simulation.reset(3)
-    env, expert = simulation._env, simulation.expert()
+    env, expert = simulation._env, Expert(simulation)
     geom = int(env._get_id_main_object())
     said = []
     for _ in range(70):

@@ -11,7 +11,9 @@ from pydantic import Field, model_validator
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
-from flowlab.pipeline.stages.shared import ObserverStage, QueriesStage, WriteStage, labeled
+from flowlab.pipeline.stages.labeled import labeled
+from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage
+from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
 from flowlab.records import Clip, Episode, QueriedDemo, Queries, TrackedDemo

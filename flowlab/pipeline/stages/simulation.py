@@ -3,12 +3,15 @@
 from flowlab.errors import DataError
 from flowlab.pipeline.memory import return_freed_memory
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
-from flowlab.pipeline.stages.shared import AcceptStage, ObserverStage, QueriesStage, WriteStage, labeled
+from flowlab.pipeline.stages.accept import AcceptStage
+from flowlab.pipeline.stages.labeled import labeled
+from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage
+from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
 from flowlab.records import Episode, QueriedDemo
 from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import ExpertSettings, Rollout, TaskSimulator
-from flowlab.sim.simulation import SceneSettings, describe_scene
+from flowlab.sim.scene_settings import SceneSettings, describe_scene
 
 __all__ = ["AcceptStage", "ExpertStage", "ObserverStage", "QueriesStage", "RigidFlowStage", "WriteStage"]
 

@@ -12,7 +12,7 @@ from flowlab.errors import MissingLibraryError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Frame
 from flowlab.sim.scene import Poses, Scene
-from flowlab.sim.simulation import SceneSettings
+from flowlab.sim.scene_settings import SceneSettings
 
 _INSTALL = (
     "OpenGL cannot be used here ({reason}); install it with 'apt-get install libegl1 libgl1-mesa-dri' "

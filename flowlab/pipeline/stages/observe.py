@@ -1,44 +1,16 @@
-"""Stages that work on any demonstration, simulated or recorded. Each is a thin skin over the function that does the
-work."""
+"""The stages that see: the clouds of every frame, and the query points on the first."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
-from flowlab.pipeline.stage import Rejected, Stage, Writer
+from flowlab.pipeline.stage import Rejected, Stage
 from flowlab.provenance import Provenance
-from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo, Tracks3D
-from flowlab.storage.shard import write_shard
-
-
-def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
-    """The episode of a demonstration whose tracks are made: simulated and real ones differ in nothing else."""
-    seen, demo = record.observed, record.observed.demo
-    return Episode(
-        task=demo.task,
-        seed=demo.seed,
-        camera=demo.camera,
-        time_s=demo.time_s,
-        point_cloud=seen.points_world,
-        point_count=seen.point_count,
-        state=demo.state,
-        action=demo.action,
-        success=demo.success,
-        queries=replace(record.queries, pixel=None),
-        tracks=tracks,
-        object_pose=demo.object_pose,
-        depth=seen.depth,
-        rgb=seen.rgb,
-        extras={**demo.extras, **extras},
-    )
+from flowlab.records import Demonstration, Frame, ObservedDemo, QueriedDemo
 
 
 class ObserverStage(Stage, ObserverSettings):
@@ -101,36 +73,3 @@ class QueriesStage(Stage, QuerySettings):
 def _settings(stage: Stage, group: type[Settings]) -> dict[str, Any]:
     """Those settings of a stage that are of a group, as JSON values: neither its name nor what a subclass adds."""
     return stage.model_dump(mode="json", include=set(group.model_fields))
-
-
-class AcceptStage(Stage):
-    """Keeps failed demonstrations out."""
-
-    stage: str = "accept"
-    success_steps: int = Field(default=5, ge=0)
-    """Steps the task must have been solved for; 5 is DP3's rule."""
-
-    def process(self, record: Episode) -> Episode:
-        """Let a successful episode pass."""
-        solved = int(record.success.sum())
-        if solved < self.success_steps:
-            raise Rejected(f"solved for {solved} steps of {len(record)}, at least {self.success_steps} asked for")
-        return record
-
-
-class WriteStage(Writer):
-    """Writes the episodes of a unit into its shard."""
-
-    stage: str = "write"
-    depth: bool = False
-    """Store the depth pictures too, so that clouds can be cropped anew later."""
-    rgb: bool = True
-    """Store the color pictures, where there are any."""
-
-    def process(self, record: Episode) -> Episode:
-        """The episode without what is not stored."""
-        return replace(record, depth=record.depth if self.depth else None, rgb=record.rgb if self.rgb else None)
-
-    def store(self, path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
-        """Write the shard in one step."""
-        write_shard(path, episodes, settings_digest)
