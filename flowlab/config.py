@@ -3,13 +3,15 @@
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass
 
-from flowlab.errors import UsageError, unknown_name
+from flowlab.errors import DataError, UsageError, unknown_name
+from flowlab.limits import MAX_YAML_BYTES
+from flowlab.text import is_plain_name, shown
+from flowlab.untrusted import parse_yaml, read_text
 
 
 class SettingsError(UsageError, ValueError):
@@ -32,6 +34,16 @@ class Settings(BaseModel, metaclass=_OneSentence):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+def _check_plain(name: str) -> str:
+    if not is_plain_name(name):
+        raise ValueError(f"{shown(name)} is no plain name: one names a file, and leads nowhere else")
+    return name
+
+
+PlainName = Annotated[str, AfterValidator(_check_plain)]
+"""A name from a file that becomes the name of a file: of a unit, a task, an array."""
+
+
 def read_named(kind: str, name: str, folder: str = ".") -> str:
     """Text of a YAML file, by its path, or by the name of one that comes with flowlab in a folder of ``pipelines``."""
     path = Path(name)
@@ -41,11 +53,9 @@ def read_named(kind: str, name: str, folder: str = ".") -> str:
             raise unknown_name(kind, name, known)
         return str(known[name].read_text())
     try:
-        return path.read_text()
-    except OSError as error:
-        raise UsageError(f"{path}: cannot read the {kind} ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path}: cannot read the {kind} (it is no UTF-8 text)") from error
+        return read_text(path, MAX_YAML_BYTES)
+    except DataError as error:
+        raise UsageError(f"{error}, expected the {kind}") from error
 
 
 def _shipped() -> Any:
@@ -89,9 +99,9 @@ def set_value(values: dict[str, Any], path: Sequence[str], text: str) -> None:
         if not isinstance(target, dict):
             raise UsageError(f"--set {text}: '{part}' holds a value, not further settings")
     try:
-        target[path[-1]] = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise UsageError(f"--set {text}: not valid YAML: '{value}'") from error
+        target[path[-1]] = parse_yaml(value)
+    except ValueError as error:
+        raise UsageError(f"--set {text}: not valid YAML: {shown(value)} ({error})") from error
 
 
 def explain(error: ValidationError, model: type[Settings]) -> str:
@@ -104,7 +114,7 @@ def explain(error: ValidationError, model: type[Settings]) -> str:
     message = first["msg"].removeprefix("Value error, ")
     if isinstance(first["input"], Mapping | BaseModel):  # to show a whole group would hide what is wrong in it
         return f"{where}: {message}" if where else message
-    return f"{where}: {message} (found {first['input']!r})"
+    return f"{where}: {message} (found {shown(first['input'])})"
 
 
 def merge(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

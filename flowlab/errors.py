@@ -3,11 +3,21 @@
 import difflib
 from collections.abc import Iterable
 
+from flowlab.limits import MAX_SHOWN
+from flowlab.text import cut, printable, shown
+
+_LONGEST = 8_000
+"""Characters of a message: whatever was found, its end stays on the screen."""
+
 
 class FlowlabError(Exception):
     """Something the user can mend. The message says what was found, what was expected, what to type."""
 
     exit_code = 1
+
+    def __init__(self, message: str) -> None:
+        text = printable(message[: 4 * _LONGEST])
+        super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} [...] {text[-_LONGEST // 2 :]}")
 
 
 class UsageError(FlowlabError):
@@ -43,11 +53,11 @@ class MissingLibraryError(FlowlabError):
 def unknown_name(kind: str, found: str, known: Iterable[str]) -> UsageError:
     """An error for a name that does not exist: near misses first, else everything that does exist."""
     names = sorted(known)
-    near = difflib.get_close_matches(found, names, n=3, cutoff=0.6)
+    near = difflib.get_close_matches(found[:MAX_SHOWN], names, n=3, cutoff=0.6)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are: {', '.join(names)}"
-    return UsageError(f"no {kind} is called '{found}'; {hint}")
+    return UsageError(f"no {kind} is called {shown(found)}; {hint}")
 
 
 def first_line(error: BaseException) -> str:
     """The first line of what an error says, or its name where it says nothing."""
-    return str(error).strip().split("\n")[0] or type(error).__name__
+    return cut(str(error).strip().split("\n")[0]) or type(error).__name__

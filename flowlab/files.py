@@ -1,4 +1,4 @@
-"""Files that are either there and whole, or not there."""
+"""Files that are either there and whole, or not there; also after a kill, a full disk or a power cut."""
 
 import fcntl
 import json
@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError, FlowlabError, MissingFileError
+from flowlab.errors import DataError, FlowlabError
 
 
 def temporary_path(path: Path) -> Path:
@@ -19,14 +19,18 @@ def temporary_path(path: Path) -> Path:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what processes of this machine that no longer run were making in a folder."""
+    """Delete what processes of this machine that no longer run were making in a folder, which is no link itself."""
+    if folder.is_symlink():
+        return
     for leftover in folder.glob(f"{_prefix()}*"):
-        if is_running(int(leftover.name.removeprefix(_prefix()).partition("+")[0])):
+        pid = leftover.name.removeprefix(_prefix()).partition("+")[0]
+        if not (pid.isascii() and pid.isdecimal()) or is_running(int(pid)):
             continue
-        if leftover.is_dir():
+        if leftover.is_dir() and not leftover.is_symlink():
             shutil.rmtree(leftover, ignore_errors=True)
         else:
-            leftover.unlink(missing_ok=True)
+            with suppress(OSError):
+                leftover.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -40,18 +44,71 @@ def new_folder(path: Path) -> Iterator[Path]:
         DataError: It cannot be written.
     """
     temporary = temporary_path(path)
+    with told_when_unwritable(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            remove_leftovers(path.parent)
+            temporary.mkdir()
+            yield temporary
+            sync_tree(temporary)
+            os.rename(temporary, path)
+            sync_folder(path.parent)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Make a file that is there whole or not at all, or replace one in one step.
+
+    Gives the path of a file beside it to write, which takes its name in the end, or is deleted if anything is raised.
+    A power cut leaves the old one or the new one, since the content is on the disk before the name is.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    temporary = temporary_path(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(path.parent)
-        temporary.mkdir()
         yield temporary
-        os.rename(temporary, path)
+        _sync(temporary)
+        os.replace(temporary, path)
+        sync_folder(path.parent)
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def told_when_unwritable(path: Path, advice: str = "choose another place") -> Iterator[None]:
+    """Turns a failure to write a file or folder into a sentence."""
+    try:
+        yield
     except FlowlabError:  # that a file to be read is missing is an OSError, too
         raise
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
+        raise DataError(f"{path}: cannot be written ({error.strerror or error}); {advice}") from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk, as far as its file system can."""
+    with suppress(OSError):
+        _sync(folder)
+
+
+def sync_tree(folder: Path) -> None:
+    """Have a folder and everything below it on the disk."""
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            _sync(Path(parent, name))
+        sync_folder(Path(parent))
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        os.close(handle)
 
 
 def _prefix() -> str:
@@ -62,7 +119,7 @@ def is_running(pid: int) -> bool:
     """Whether a process of this machine runs."""
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True
@@ -81,26 +138,12 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace a file in one step."""
-    temporary = temporary_path(path)
-    try:
-        temporary.write_text(text)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def write_atomically(path: Path, text: str | bytes) -> None:
+    """Replace a file in one step. Raises :class:`OSError`."""
+    with new_file(path) as temporary:
+        temporary.write_bytes(text.encode() if isinstance(text, str) else text)
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Replace a JSON file in one step; the same values give the same bytes."""
+    """Replace a JSON file in one step; the same values give the same bytes. Raises :class:`OSError`."""
     write_atomically(path, json.dumps(values, indent=1) + "\n")
-
-
-def read_json(path: Path) -> Any:
-    """The values of a JSON file."""
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: there is no such file") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not valid JSON ({error}); restore it or extract again into a new folder") from error

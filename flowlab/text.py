@@ -1,8 +1,45 @@
 """Small things about text that many rooms need."""
 
 import re
+import reprlib
+
+from flowlab.limits import MAX_SHOWN
+
+_UNPRINTABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Controls, terminal escapes, turns of the writing direction and halves of characters; not the end of a line."""
+_LONGEST_NAME = 150
+"""Bytes; file systems take 255, and a file in the making has a longer name."""
 
 
 def natural_key(text: str) -> list[str | int]:
     """What to sort names by so that take-2 comes before take-10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", text)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d{1,18})", text)]
+
+
+def printable(text: str) -> str:
+    """Text from a file, fit for a terminal: what could move the cursor or cannot be printed is escaped."""
+    return _UNPRINTABLE.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def shown(value: object, limit: int = MAX_SHOWN) -> str:
+    """A value from a file as an error shows it: text in quotes, else as Python writes it; in one line, and cut."""
+    if isinstance(value, str):
+        return f"'{cut(value, limit)}'"
+    short = reprlib.Repr()  # makes no more than it shows; aliases of YAML can make a value huge
+    short.maxlevel, short.maxstring, short.maxother = 3, limit, limit
+    try:
+        return cut(short.repr(value), limit)
+    except ValueError:  # Python writes no integer of more than 4,300 digits
+        return "a number of thousands of digits"
+
+
+def cut(text: str, limit: int = MAX_SHOWN) -> str:
+    """Text from a file or of a library, as an error repeats it: printable, in one line, no longer than that."""
+    line = printable(text[: limit + 1]).replace("\n", " ")
+    return line if len(line) <= limit else line[:limit] + "..."
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether text can name a file in a folder, and nothing outside of it."""
+    fits = 0 < len(name.encode("utf-8", "surrogateescape")) <= _LONGEST_NAME
+    return fits and not name.startswith(".") and not _UNPRINTABLE.search(name) and not re.search(r"[/\\\n]", name)

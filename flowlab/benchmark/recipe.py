@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-import yaml
 from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
 
 from flowlab.config import Settings, explain, read_named
 from flowlab.errors import UsageError, unknown_name
 from flowlab.evaluation.trials import Trial, list_trials
 from flowlab.sim.tasks import tasks_named
+from flowlab.untrusted import parse_yaml
 
 
 class PolicyVariant(Settings):
@@ -60,8 +60,8 @@ def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
     Raises :class:`UsageError` naming what is missing, unknown or wrong.
     """
     try:
-        values = yaml.safe_load(read_named("experiment", name, "bench"))
-    except yaml.YAMLError as error:
+        values = parse_yaml(read_named("experiment", name, "bench"))
+    except ValueError as error:
         raise UsageError(f"experiment {name}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
         raise UsageError(f"experiment {name}: is a mapping with the keys {', '.join(ExperimentRecipe.model_fields)}")

@@ -12,8 +12,9 @@ from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import read_evaluations
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
-from flowlab.files import read_json, write_atomically
+from flowlab.files import write_atomically
 from flowlab.policies.checkpoint import read_trained
+from flowlab.untrusted import read_json
 
 UNITS = "units"
 """Folder of an experiment that holds its results."""

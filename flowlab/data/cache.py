@@ -12,8 +12,9 @@ import numpy as np
 
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError
-from flowlab.files import locked, read_json, remove_leftovers, temporary_path, write_json
+from flowlab.files import locked, remove_leftovers, temporary_path, write_json
 from flowlab.records import Episode
+from flowlab.untrusted import read_json
 
 INDEX = "index.json"
 """Written last: a folder that has it is whole."""

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float32, Int8
 from numpy.lib.npyio import NpzFile
 
 from flowlab.errors import DataError
-from flowlab.files import read_json
 from flowlab.text import natural_key
+from flowlab.untrusted import read_json
 
 FILE_NAME = "ground_truth.npz"
 MADE_WITH = "simulated.json"

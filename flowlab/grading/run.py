@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from flowlab.arguments import check_count, check_names, check_path, check_paths, check_settings
 from flowlab.errors import FlowlabError, UsageError, unknown_name
 from flowlab.files import write_json
@@ -17,6 +15,7 @@ from flowlab.sim.loading import load_mujoco
 from flowlab.tracking.base import Tracker, make_tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.lifting import LiftSettings
+from flowlab.untrusted import parse_yaml
 
 REPORT = "grade.json"
 _SETTINGS_FORM = "a list of strings, as in settings=['chunk=33']"
@@ -125,8 +124,8 @@ def make_graded_tracker(name: str, names: Sequence[str], settings: Sequence[str]
             raise UsageError(f"--set {change}: {unknown_name('tracker of this run', whose, names)}")
         if whose in ("", name):
             try:
-                options[option] = yaml.safe_load(value)
-            except yaml.YAMLError as error:
+                options[option] = parse_yaml(value)
+            except ValueError as error:
                 raise UsageError(f"--set {change}: not valid YAML: '{value}'") from error
     return make_tracker(name, options)
 

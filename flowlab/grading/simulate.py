@@ -12,7 +12,7 @@ from pydantic import Field
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, unknown_name
-from flowlab.files import read_json, temporary_path, write_json
+from flowlab.files import temporary_path, write_json
 from flowlab.grading.ground_truth import MADE_WITH, GroundTruth
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import EdgeSettings, QuerySettings, away_from_edges, sample_queries
@@ -22,6 +22,7 @@ from flowlab.records import Frame, Role
 from flowlab.sim.pixel_tracks import surface_tracks
 from flowlab.sim.scene_settings import CameraSettings, SceneSettings
 from flowlab.sim.sensor import KINECT, PRESETS, Sensor, SensorSettings
+from flowlab.untrusted import read_json
 
 UNUSABLE_M = 0.005
 """A query whose sensor depth in the first frame is farther than this from the true surface is not graded:

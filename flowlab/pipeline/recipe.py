@@ -7,13 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import Field, PrivateAttr, SerializeAsAny, ValidationError, ValidationInfo, field_validator
 
 from flowlab.config import Settings, explain, override, read_named, set_value
 from flowlab.errors import UsageError
 from flowlab.pipeline.stage import Pipeline, Stage
 from flowlab.registry import STAGES
+from flowlab.untrusted import parse_yaml
 
 _EXAMPLE = "observer.points=512"
 
@@ -88,8 +88,8 @@ def parse_recipe(text: str, origin: str, overrides: Iterable[str] = (), folder: 
         UsageError: Something in the recipe or in an override does not fit.
     """
     try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        values = parse_yaml(text)
+    except ValueError as error:
         raise UsageError(f"{origin}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
         raise UsageError(f"{origin}: a recipe is a mapping with the keys {', '.join(Recipe.model_fields)}")

@@ -19,10 +19,11 @@ from flowlab.config import Settings, explain
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, UsageError
-from flowlab.files import read_json, remove_leftovers, temporary_path, write_json
+from flowlab.files import remove_leftovers, temporary_path, write_json
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
 from flowlab.storage.manifest import differences
+from flowlab.untrusted import read_json
 from flowlab.version import __version__
 
 POLICY = "policy.json"

@@ -4,13 +4,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
 from pydantic import BeforeValidator, SerializeAsAny, ValidationError
 
 from flowlab.config import Settings, explain, merge, override, read_named
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.registry import POLICIES
+from flowlab.untrusted import parse_yaml
 
 _EXTENDS, _POLICIES = "extends", "policies"
 """Keys of a profile beside the settings."""
@@ -92,8 +92,8 @@ def _read_profile(profile: str, policy: str, before: tuple[str, ...]) -> dict[st
     if profile in before:
         raise UsageError(f"{origin}: extends itself ({' -> '.join((*before, profile))}); take one extends: out")
     try:
-        values: Any = yaml.safe_load(read_named("profile", profile, "train")) or {}
-    except yaml.YAMLError as error:
+        values: Any = parse_yaml(read_named("profile", profile, "train")) or {}
+    except ValueError as error:
         raise UsageError(f"{origin}: not valid YAML: {error}") from error
     if not isinstance(values, dict):
         raise UsageError(f"{origin}: must be a mapping of settings, as in 'extends: fast' and 'horizon: 8'")

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from jaxtyping import Num
 from pydantic import AfterValidator, Field, ValidationError
 
 from flowlab.config import Settings
 from flowlab.errors import DataError, unknown_name
+from flowlab.text import shown
+from flowlab.untrusted import read_yaml
 
 FILE_NAME = "recording.yaml"
 Row = tuple[float, float, float, float]
@@ -131,16 +132,9 @@ class Metadata(Settings):
 
 def load_metadata(path: Path) -> Metadata:
     """The content of a YAML file. Raises :class:`DataError` that names the key."""
-    try:
-        values = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise DataError(
-            f"{path}: cannot be read ({error.strerror}); it is a YAML file as docs/recordings.md"
-        ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    values = read_yaml(path)
     if values is not None and not isinstance(values, dict):
-        raise DataError(f"{path}: must be a mapping such as 'fps: 30', found {values!r}")
+        raise DataError(f"{path}: must be a mapping such as 'fps: 30', found {shown(values)}")
     try:
         return Metadata.model_validate(values or {})
     except ValidationError as error:

@@ -10,11 +10,11 @@ from pydantic import ValidationError
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
-from flowlab.files import read_json
 from flowlab.provenance import Provenance
 from flowlab.storage.migrations import migrate_manifest
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.schema import SCHEMA_VERSION
+from flowlab.untrusted import read_json
 from flowlab.version import __version__
 
 MANIFEST = "flowlab.json"

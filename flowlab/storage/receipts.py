@@ -10,8 +10,9 @@ from pydantic import ValidationError, model_validator
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
-from flowlab.files import read_json, write_json
+from flowlab.files import write_json
 from flowlab.storage.migrations import migrate_receipt
+from flowlab.untrusted import read_json
 from flowlab.version import __version__
 
 
