@@ -297,7 +297,7 @@ def test_the_recipe_that_comes_with_flowlab_is_the_papers() -> None:
 
 WRONG: dict[str, tuple[list[str], str]] = {
     "recipe": (["--recipe", "papr"], "no experiment is called 'papr'; did you mean paper?"),
-    "recipe file": (["--recipe", "no.yaml"], "no.yaml: cannot read the experiment (No such file or directory)"),
+    "recipe file": (["--recipe", "no.yaml"], "no.yaml: there is no such file, expected the experiment"),
     "policy": (["--policies", "fdp,fpd"], "no policy is called 'fpd'; did you mean fdp?"),
     "task": (["--task", "drawer-opn"], "no task is called 'drawer-opn'; did you mean drawer-open"),
     "group": (["--group", "hardest"], "hardest"),

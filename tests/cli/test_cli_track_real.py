@@ -259,7 +259,7 @@ MISTAKES = {
     "stride beyond chunk": ("rec --out x --chunk 8 --stride 8", 2, "stride (8) must be below length (8)"),
     "no such path": ("nowhere --out x", 2, "nowhere: there is no such file or folder"),
     "no recordings": ("empty --out x", 2, "empty: no recording at or below it; looked for"),
-    "no calibration": ("rec --out x --calibration c.yaml", 3, "c.yaml: cannot be read"),
+    "no calibration": ("rec --out x --calibration c.yaml", 3, "c.yaml: there is no such file"),
     "recipe of simulation": ("rec --out x --recipe metaworld", 2, "needs a 'recording' stage"),
     "task that is no name": ("rec --out x --task a/b", 2, "'a/b' cannot be the name of a task"),
     "file as out": ("rec --out file", 3, "choose another --out"),

@@ -259,7 +259,7 @@ def test_another_network_is_refused(rolls: Path, taught: Path, tmp_path: Path, c
 WRONG: dict[str, tuple[list[str], int, str]] = {
     "no policy of that name": (["--policy", "fpd"], 2, "no policy is called 'fpd'; did you mean fdp?"),
     "no profile of that name": (["--profile", "fsat"], 2, "no profile is called 'fsat'; did you mean fast?"),
-    "no profile file": (["--profile", "no.yaml"], 2, "no.yaml: cannot read the profile (No such file"),
+    "no profile file": (["--profile", "no.yaml"], 2, "no.yaml: there is no such file, expected the profile"),
     "no group of settings": (options("motoin.points=3"), 2, "no setting of fdp is called 'motoin'; there are: "),
     "no setting": (options("motion.point=3"), 2, "motion.point: no setting is called 'point'; did you mean points?"),
     "no value": (options("motion.points"), 2, "--set motion.points: must look like batch.windows=64"),

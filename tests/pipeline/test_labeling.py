@@ -292,7 +292,7 @@ def test_a_task_must_be_usable_as_a_file_name(tmp_path: Path, recipe: Recipe, ta
 
 def test_a_calibration_file_that_is_missing_is_told_before_any_work(tmp_path: Path, recordings: Path) -> None:
     recipe = load_recipe("real", [*SMALL, f"recording.calibration={tmp_path / 'none.yaml'}"])
-    with pytest.raises(DataError, match=r"none\.yaml: cannot be read"):
+    with pytest.raises(DataError, match=r"none\.yaml: there is no such file"):
         find_jobs(recipe, [recordings])
 
 

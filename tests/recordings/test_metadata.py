@@ -54,7 +54,7 @@ def test_a_mistake_is_one_sentence_with_file_and_key(tmp_path: Path, text: str, 
 
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"nowhere\.yaml: cannot be read \(No such file"):
+    with pytest.raises(DataError, match=r"nowhere\.yaml: there is no such file"):
         load_metadata(tmp_path / "nowhere.yaml")
 
 
