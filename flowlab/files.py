@@ -79,6 +79,20 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def output_file(path: Path) -> Iterator[Path]:
+    """:func:`new_file` where a user asked for it, in a folder that need not exist; leftovers beside it are deleted.
+
+    Raises:
+        DataError: It cannot be written.
+    """
+    with told_when_unwritable(path, "choose another file or make room"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
+        with new_file(path) as temporary:
+            yield temporary
+
+
+@contextmanager
 def told_when_unwritable(path: Path, advice: str = "choose another place") -> Iterator[None]:
     """Turns a failure to write a file or folder into a sentence."""
     try:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from flowlab.cli.console import print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table
 from flowlab.errors import DataError
 
 
@@ -46,7 +46,7 @@ def info(dataset: Path, as_json: bool) -> None:
         )
         return
     for name, value in about.items():
-        click.echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
+        echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
     print_table(["task", "episodes", "asked for", "frames", "rejected"], [list(t.values()) for t in tasks])
     columns = ["array", "dimensions", "shape of the first shard", "type", "unit"]
     print_table(columns, [list(a.values()) for a in arrays])
@@ -74,13 +74,13 @@ def validate(dataset: Path, as_json: bool) -> None:
     for finding in findings_of(dataset):
         findings.append(finding)
         if not as_json:
-            click.echo(str(finding))
+            echo(str(finding))
     if as_json:
         print_json([{"file": f.place, "problem": f.problem} for f in findings])
     if findings:
         raise DataError(f"{dataset}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
     if not as_json:
-        click.echo(f"{dataset}: sound")
+        echo(f"{dataset}: sound")
 
 
 @click.command()
@@ -99,4 +99,4 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     from flowlab.storage.exporters.base import make_exporter
 
     count = make_exporter(exporter, settings).export(Dataset(dataset), out, task)
-    click.echo(f"{count} episodes written to {out} for {exporter}")
+    echo(f"{count} episodes written to {out} for {exporter}")
