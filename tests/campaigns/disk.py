@@ -29,7 +29,7 @@ def main(seed: int, count: int, budget: float, only: tuple[str, ...], keep: Path
     warm_up()
     campaign = Campaign("disk", OUTCOMES, ("told", "tolerated"), keep)
     scenes = [SCENES[name] for name in only or SCENES]
-    place = Workplace(campaign.folder, tuple({need for scene in scenes for need in scene.needs}))
+    place = Workplace(campaign.folder)
     known: dict[str, Undisturbed] = {}
     for number in campaign.trials(seed, count, budget):
         scene, chance = scenes[number % len(scenes)], random.Random(number)

@@ -37,7 +37,7 @@ def main(seed: int, count: int, budget: float, only: tuple[str, ...], keep: Path
     warm_up()
     campaign = Campaign("kill", OUTCOMES, ("ok", "undisturbed"), keep)
     scenes = [SCENES[name] for name in only or SCENES]
-    place = Workplace(campaign.folder, tuple({need for scene in scenes for need in scene.needs}))
+    place = Workplace(campaign.folder)
     known: dict[str, Undisturbed] = {}
     for number in campaign.trials(seed, count, budget):
         scene = scenes[number % len(scenes)]

@@ -77,15 +77,15 @@ SCENES = {
 class Workplace:
     """A folder with the inputs, and a fresh folder below it for every trial."""
 
-    def __init__(self, folder: Path, wanted: tuple[str, ...]) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder, self._trial = folder, folder / "trial"
         self.inputs = folder / "inputs"
         self.inputs.mkdir(parents=True, exist_ok=True)
-        for name in wanted:
-            self._have(name)
 
     def trial(self, needs: tuple[str, ...]) -> Path:
         """An empty folder but for copies of these inputs; always of the same name, which some files hold."""
+        for name in needs:
+            self._have(name)
         shutil.rmtree(self._trial, ignore_errors=True)
         self._trial.mkdir()
         for name in needs:
@@ -101,8 +101,6 @@ class Workplace:
     def make(self, scene: str, *names: tuple[str, str]) -> None:
         """Run a scene's command and keep what it made under other names."""
         of = SCENES[scene]
-        for need in of.needs:
-            self._have(need)
         folder = self.trial(of.needs)
         succeed(of.command, folder)
         for made, name in names:
@@ -164,6 +162,14 @@ def _make_stopped(place: Workplace) -> None:
     raise RuntimeError("no killed run could be resumed")
 
 
+def _make_cached(place: Workplace) -> None:
+    """A dataset that was trained on, with its decoded cache wherever that is now."""
+    train = SCENES["train"]
+    folder = place.trial(train.needs)
+    succeed(train.command, folder)
+    shutil.copytree(folder / "data", place.inputs / "cached")
+
+
 _MAKERS: dict[str, Callable[[Workplace], None]] = {
     "rec": _make_recordings,
     "slide": _make_slide,
@@ -174,5 +180,6 @@ _MAKERS: dict[str, Callable[[Workplace], None]] = {
     "tried": lambda place: place.make("eval", ("run", "tried")),
     "store": lambda place: place.make("export", ("store", "store")),
     "bench": lambda place: place.make("bench", ("bench", "bench")),
+    "cached": _make_cached,
     "stopped": _make_stopped,
 }
