@@ -48,6 +48,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             remove_leftovers(path.parent)
+            _clear(temporary)
             temporary.mkdir()
             yield temporary
             sync_tree(temporary)
@@ -69,6 +70,7 @@ def new_file(path: Path) -> Iterator[Path]:
     """
     temporary = temporary_path(path)
     try:
+        _clear(temporary)
         yield temporary
         _sync(temporary)
         os.replace(temporary, path)
@@ -115,6 +117,14 @@ def sync_tree(folder: Path) -> None:
         for name in names:
             _sync(Path(parent, name))
         sync_folder(Path(parent))
+
+
+def _clear(temporary: Path) -> None:
+    """Free a name that only this process gives: what is there was left by one of the same number, or laid as a trap."""
+    if temporary.is_dir() and not temporary.is_symlink():
+        shutil.rmtree(temporary)
+    else:
+        temporary.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:

@@ -31,8 +31,9 @@ from tests.campaigns.sandbox import HUNG, Ended, call, warm_up
 from tests.campaigns.scenes import SCENES, Workplace
 
 OUTCOMES = ("held", "executed", "touched", "traceback", "hung", "escape", "believed")
-NAMES = ("../x", "/abs", "[/red]", "a|b`c`", "n" * 300, "\x1b[31mred\x1b[0m", "nul\0", "=cmd|' /C calc'!A0", "$\\frac{",
-         "<script>alert(1)</script>", "line\nbreak", "\u202egnp.exe", ".hidden", "~", "-rf", "CON", ":smile:")  # fmt: skip
+NAMES = ("../x", "/abs", "[/red]", "a|b`c`", "n" * 300, "\x1b[31mred\x1b[0m", "nul\0", "=cmd|' /C calc'!A0",
+         "$\\frac{", "<script>alert(1)</script>", "line\nbreak", "\u202egnp.exe", ".hidden", "~", "-rf",
+         "CON", ":smile:")  # fmt: skip
 MODULES = ("json", "yaml", "torch", "numpy", "sitecustomize", "usercustomize", "zarr", "rich", "click", "pickle",
            "flowlab", "synthetic", "cv2", "av", "rerun", "matplotlib", "ctypes", "random", "string")  # fmt: skip
 
@@ -80,7 +81,8 @@ class Arena:
 
     def evil_code(self, name: str) -> str:
         """A module that leaves a marker."""
-        return f"import os\nos.makedirs({str(self.marker)!r}, exist_ok=True)\nopen({str(self.marker / name)!r}, 'w').close()\n"
+        folder, file = str(self.marker), str(self.marker / name)
+        return f"import os\nos.makedirs({folder!r}, exist_ok=True)\nopen({file!r}, 'w').close()\n"
 
     def evil_pickle(self, name: str) -> bytes:
         return pickle.dumps(_Evil(f"mkdir -p {self.marker} && touch {self.marker / name}"))
@@ -184,7 +186,7 @@ def _look_at(arena: Arena, dataset: str) -> None:
     arena.run("viz", dataset, "--png", "a.png", "--mp4", "a.mp4", "--save", "a.rrd")
     arena.run("viz", dataset, "--rejects", "--png", "b.png")
     arena.run("export", dataset, "--to", "dp3", "--out", "out-store")
-    arena.run("train", dataset, *SCENES["train"].command[2:-5], "--set", "run.steps=1")
+    arena.run("train", dataset, *SCENES["train"].command[2:], "--set", "run.steps=1")
 
 
 def _look_at_run(arena: Arena, run: str) -> None:
@@ -272,6 +274,18 @@ def _(arena: Arena) -> None:
     arena.run_program("viz", "data", "--png", "a.png")
 
 
+@case("a log of MuJoCo that is a link")
+def _(arena: Arena) -> None:
+    (arena.here / "MUJOCO_LOG.TXT").symlink_to(arena.outside / "victim.txt")
+    (arena.here / "unstable.py").write_text(
+        "from flowlab.sim.simulation import Simulation\nimport mujoco\n"
+        'model = mujoco.MjModel.from_xml_string(\'<mujoco><worldbody><body><freejoint/><geom size=".1"/></body>'
+        "</worldbody></mujoco>')\ndata = mujoco.MjData(model)\ndata.qvel[:] = float('nan')\n"
+        "mujoco.mj_step(model, data)\n"
+    )
+    subprocess.run([sys.executable, "unstable.py"], cwd=arena.here, check=True, capture_output=True)
+
+
 @case("a cache that is a link", "data")
 def _(arena: Arena) -> None:
     for name in ("cache", "figures"):
@@ -340,15 +354,16 @@ def _temporary_names() -> None:
             def prepare() -> None:
                 names = {p.name for p in arena.here.rglob("*")} | {
                     "flowlab.json", "stats.json", "README.md", "rejects.jsonl", "policy.json", "run.json", "store",
-                    "resume.safetensors", "grade.json", "grade.png", "report.html", "report.json", "report.csv", "a.png",
-                    "episodes.csv", "a.mp4", "a.rrd", "training.png", "curve.png", "metrics.jsonl",
+                    "resume.safetensors", "grade.json", "grade.png", "report.html", "report.json", "report.csv",
+                    "a.png", "episodes.csv", "a.mp4", "a.rrd", "training.png", "curve.png", "metrics.jsonl",
                 }  # fmt: skip
                 folders = {arena.here, *(p for p in arena.here.rglob("*") if p.is_dir())}
                 for folder in [*folders, *(arena.here / made for made in scene.makes if "." not in made)]:
                     folder.mkdir(exist_ok=True) if folder.suffix == "" and folder.name != "store" else None
                     for name in names if folder.is_dir() else ():
                         link = folder / f".tmp-{socket.gethostname()}+{os.getpid()}+{name}"
-                        link.symlink_to(arena.outside / f"new-{name}")
+                        with suppress(FileExistsError):
+                            link.symlink_to(arena.outside / f"new-{name}")
 
             arena.run(*scene.command, before=prepare)
 
