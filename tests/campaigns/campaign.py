@@ -1,5 +1,6 @@
 """What every campaign has in common: its options, its table, what it keeps of findings, and when it stops."""
 
+import re
 import shutil
 import sys
 import tempfile
@@ -66,7 +67,8 @@ class Campaign:
         click.echo(self.findings[-1], err=True)
         if folder is not None and self._kept[row] < 3:
             self._kept[row] += 1
-            target = self._keep / self.name / f"{row}-{len(self.findings)}"
+            name = re.sub(r"[^\w.-]+", "-", row)
+            target = self._keep / self.name / f"{name}-{len(self.findings)}"
             shutil.rmtree(target, ignore_errors=True)
             shutil.copytree(folder, target, symlinks=True, ignore_dangling_symlinks=True)
             (target.parent / f"{target.name}.txt").write_text(about + "\n")

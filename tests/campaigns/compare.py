@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 _OF_THE_MOMENT = re.compile(
-    r"(^|_)(s|ms|ms_per_frame|cpu|wall|time|seconds|memory_mb|peak|created|made|date|digest|digests|samples_per_s)$"
+    r"^sha256$|(^|_)(s|ms|ms_per_frame|cpu|wall|time|seconds|memory_mb|peak|created|made|date|digest|digests|samples_per_s)$"
 )
 """Keys whose values are of one run: how long it took, when it was, and digests over files that hold such."""
 _UNCOMPARED = re.compile(r"\.(rrd|log|lock)$|(^|/)training\.png$|(^|/)curve\.png$|(^|/)report\.(html|json|csv)$")
