@@ -80,6 +80,7 @@ def main(*args: Any) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show is escaped
+    os.environ["PYTHONSAFEPATH"] = "1"  # of Pythons that libraries start: nothing of the current folder is imported
     try:
         _check_folder()
         cli.main(list(args) or None, prog_name="flowlab", standalone_mode=False)
