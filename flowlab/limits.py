@@ -22,6 +22,8 @@ MAX_LOADED_BYTES = 1 << 30
 """Of an array that is read into memory at once."""
 MAX_WEIGHTS_BYTES = 8 << 30
 """Of a file of a network's weights."""
+MAX_CHUNKS = 1_000_000
+"""Of an array; each is a file."""
 MAX_CHUNK_BYTES = 256 << 20
 """That a compressed part of a ROS recording may unpack to."""
 MAX_READER_BYTES = 4 << 30
