@@ -26,7 +26,7 @@ MAX_CHUNKS = 1_000_000
 """Of an array; each is a file."""
 MAX_CHUNK_BYTES = 256 << 20
 """That a compressed part of a ROS recording may unpack to."""
-MAX_READER_BYTES = 4 << 30
+MAX_READER_BYTES = 1 << 30
 """Of memory that the index or a message of a ROS recording may take."""
 MAX_UNPACKING = 50
 """Bytes that a compressed file may unpack to for each of its own, where they are more than ``MAX_LOADED_BYTES``."""

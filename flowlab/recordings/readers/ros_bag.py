@@ -52,6 +52,7 @@ class RosBag:
             self._reader: AnyReader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             with limited_memory():
                 self._reader.open()
+                self._counts = {topic: int(about.msgcount) for topic, about in self._reader.topics.items()}
         except Exception as error:  # rosbags lets through what its parsers raise
             raise DataError(f"{path}: is no readable ROS recording ({_words(error)})") from error
 
@@ -59,8 +60,8 @@ class RosBag:
         """Topics that hold messages of these types, with how many."""
         found: dict[str, int] = {}
         for c in self._reader.connections:
-            if c.msgtype in types and self._count(c.topic):
-                found[c.topic] = self._count(c.topic)
+            if c.msgtype in types and self._counts.get(c.topic):
+                found[c.topic] = self._counts[c.topic]
         return dict(sorted(found.items()))
 
     def types(self) -> dict[str, str]:
@@ -115,10 +116,6 @@ class RosBag:
     def _connections(self, topic: str) -> "list[Connection]":
         """The connections of a topic."""
         return [c for c in self._reader.connections if c.topic == topic]
-
-    def _count(self, topic: str) -> int:
-        """How many messages a topic has."""
-        return self._reader.topics[topic].msgcount
 
 
 def _words(error: BaseException) -> str:
