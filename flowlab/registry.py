@@ -55,7 +55,7 @@ class Registry(Generic[T]):
             self.load(plugin.name)
         except UsageError as error:
             return str(error)
-        except Exception as error:  # whatever its module does
+        except (Exception, SystemExit) as error:  # whatever its module does
             return f"{self.kind} '{plugin.name}' of {plugin.package}: cannot be imported ({first_line(error)})"
         return ""
 
@@ -98,7 +98,7 @@ class Registry(Generic[T]):
             raise UsageError(f"{self.kind} '{name}': is offered by {packages}; uninstall one of them")
         try:
             return found[0].load()
-        except Exception as error:  # whatever somebody's package does
+        except (Exception, SystemExit) as error:  # whatever somebody's package does
             if _package(found[0]).startswith("flowlab "):
                 raise
             raise UsageError(
@@ -114,7 +114,7 @@ class Registry(Generic[T]):
                 imported = importlib.import_module(module)
                 _remember(package, imported, folder)
                 return getattr(imported, attribute)
-            except Exception as error:  # whatever somebody's module does
+            except (Exception, SystemExit) as error:  # whatever somebody's module does
                 raise UsageError(
                     f"{self.kind} '{place}': cannot be imported ({first_line(error)}){self._where(error, folder)}"
                 ) from error

@@ -173,6 +173,8 @@ def _mutate_yaml(content: bytes, rng: random.Random) -> bytes:
     if rng.random() < 0.1:
         levels = "\n".join(f"l{k}: &l{k} [{', '.join([f'*l{k - 1}'] * 9)}]" for k in range(1, 10))
         return content + f"\nl0: &l0 [x]\n{levels}\n".encode()
+    if b"&l0" in content:  # such a bomb would go off here
+        return _mutate_bytes(content, rng)
     values = mutate_values(yaml.safe_load(content), rng)
     return yaml.dump(values, allow_unicode=True).encode("utf-8", "surrogatepass")
 
