@@ -304,13 +304,16 @@ class Episode(Record):
     def __len__(self) -> int:
         return len(self.action)
 
-    def _check_values(self) -> None:
+    def check_numbers(self) -> None:
+        """Refuse what nobody may store. An episode that is read may have it: a damaged dataset has to be looked into.
+
+        Raises:
+            RecordError: Times do not rise, numbers of the robot are not finite, or counts cannot be.
+        """
         _check_rows(self)
-        if len(self.point_count) and not (
-            self.point_count.min() >= 0 and self.point_count.max() <= self.point_cloud.shape[1]
-        ):
-            found = f"{self.point_count.min()} to {self.point_count.max()}"
-            raise self._wrong("point_count", f"ranges from {found}, expected 0 to {self.point_cloud.shape[1]}")
+        low, high, most = self.point_count.min(initial=0), self.point_count.max(initial=0), self.point_cloud.shape[1]
+        if not 0 <= low <= high <= most:
+            raise self._wrong("point_count", f"ranges from {low} to {high}, expected 0 to {most}")
 
     @property
     def flow(self) -> Float[np.ndarray, "T M 3"]:

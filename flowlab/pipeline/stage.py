@@ -140,6 +140,7 @@ class Pipeline:
         for stage in self.stages:
             record = self._process(stage, record)
         assert isinstance(record, Episode)
+        record.check_numbers()
         return record
 
     def store(self, path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:

@@ -5,6 +5,8 @@
 
 import faulthandler
 import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))  # which forks want
 import random
 import resource
 import select
@@ -21,6 +23,7 @@ from io import StringIO
 from pathlib import Path
 
 import click
+import cv2
 
 from flowlab.errors import FlowlabError
 from tests.campaigns.fuzz_kinds import KINDS, Kind, change
@@ -102,6 +105,7 @@ def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, p
     os.chdir(scratch)
     os.environ.update(HOME=str(scratch), XDG_CACHE_HOME=str(scratch / "cache"), TMPDIR=str(scratch))
     tempfile.tempdir = str(scratch)
+    cv2.setNumThreads(1)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, used + _MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -162,7 +166,7 @@ def _listen(pipe: int, child: int, tally: Tally, indices: range) -> int:
     while True:
         ready, _, _ = select.select([pipe], [], [], _SECONDS)
         if not ready:
-            os.kill(child, signal.SIGABRT if _was_quick(child) else signal.SIGKILL)
+            os.kill(child, signal.SIGKILL)
             return last
         more = os.read(pipe, 1 << 16)
         if not more:
@@ -172,11 +176,6 @@ def _listen(pipe: int, child: int, tally: Tally, indices: range) -> int:
             number, _, what = line.decode().partition(" ")
             last = int(number)
             _count(tally, last, what)
-
-
-def _was_quick(child: int) -> bool:
-    """No child that says nothing is quick; it is killed."""
-    return False
 
 
 def _count(tally: Tally, index: int, what: str) -> None:
@@ -211,10 +210,13 @@ def fuzz_kind(kind: Kind, seed: int, count: int, seconds: float, scratch: Path) 
 
 def _warm_up(kind: Kind, sample: Path, scratch: Path) -> None:
     """Have everything imported and compiled before children are forked, and see that the sample is a good one."""
+    import matplotlib.font_manager  # which looks for fonts by a program of its own
+
+    assert matplotlib
     shutil.copytree(sample, scratch / "case")
     for k in range(3):
         found = outcome(kind, scratch / "case", case_rng(0, kind.name, k))
-        if found != "value" and kind.of != "nothing":
+        if found.startswith(("bad", "net")):
             raise click.ClickException(f"{kind.name}: the sample itself fails: {found}")
 
 
@@ -249,14 +251,13 @@ def main(seed: int, count: int, budget: float, kinds: tuple[str, ...], keep: Pat
 
 def _keep(kind: Kind, seed: int, tally: Tally, keep: Path, scratch: Path) -> None:
     """Keep an input of every finding."""
-    for k, where in enumerate(tally.findings.values()):
+    for where in tally.findings.values():
         prepare(kind, scratch / "sample", seed, where[0], scratch / "case")
         target = keep / f"{kind.name}-{seed}-{where[0]}"
         if not target.exists():
             keep.mkdir(parents=True, exist_ok=True)
             shutil.copytree(scratch / "case", target, symlinks=True, ignore=lambda d, names: [
                 n for n in names if not (Path(d, n).is_file() or Path(d, n).is_dir())])  # fmt: skip
-        assert k >= 0
 
 
 if __name__ == "__main__":

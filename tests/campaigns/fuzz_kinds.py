@@ -416,8 +416,7 @@ def _windows(folder: Path) -> None:
     from flowlab.storage.dataset import open_dataset
 
     data = open_dataset(folder / "d")
-    for ref in data.refs[:1]:
-        repr(data.episode(ref))
+    repr(data.episode(0))
     windows = Windows(data, {"state": [-1, 0], "point_cloud": [0], "action": range(3)}, cache=folder / "cache")
     windows[0], windows[len(windows) - 1], windows.stats
 
@@ -425,6 +424,9 @@ def _windows(folder: Path) -> None:
 def _run(name: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         shutil.copytree(OLD / "runs" / name, folder / "run")
+        shutil.copytree(OLD / "dataset-sim", folder / "d")
+        about = json.loads((folder / "run/run.json").read_text())
+        (folder / "run/run.json").write_text(json.dumps({**about, "dataset": "case/d"}))
 
     return make
 
@@ -491,9 +493,9 @@ KINDS = {
         Kind("dataset-new", _new_dataset, _use_dataset, share=2),
         Kind("dataset-sim", _dataset("dataset-sim"), _use_dataset),
         Kind("dataset-real", _dataset("dataset-real"), _use_dataset),
-        Kind("run-fdp", _run("fdp"), _use_run),
-        Kind("run-dp3", _run("dp3"), _use_run),
-        Kind("run-interrupted", _run("fdp-interrupted"), _use_run),
+        Kind("run-fdp", _run("fdp"), _use_run, "run/**/*"),
+        Kind("run-dp3", _run("dp3"), _use_run, "run/**/*"),
+        Kind("run-interrupted", _run("fdp-interrupted"), _use_run, "run/**/*"),
         Kind("results", _experiment, _use_experiment),
     )
 }

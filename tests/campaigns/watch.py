@@ -38,7 +38,7 @@ class Watch:
             for path in arguments[:2]:
                 if isinstance(path, str | bytes | os.PathLike) and not self._is_inside(path):
                     self._add(f"{event} {path}")
-        elif event in _STARTS:
+        elif event in _STARTS and arguments != (None,):  # as which ctypes opens the program itself
             self._add(f"{event} {str(arguments)[:200]}")
         elif event == "exec" and str(getattr(arguments[0], "co_filename", "")).startswith(self.inside):
             self._add(f"ran {arguments[0].co_filename}")
