@@ -36,7 +36,11 @@ def map_array(path: Path) -> np.ndarray:
 
 
 def load_array(path: Path, limit: int = MAX_LOADED_BYTES) -> np.ndarray:
-    """All of an ``.npy`` file. Raises :class:`DataError` as :func:`map_array`, and where it is larger than ``limit``."""
+    """All of an ``.npy`` file.
+
+    Raises:
+        DataError: As :func:`map_array`, and where it is larger than ``limit``.
+    """
     size = check_regular(path, limit)
     with _told(path), path.open("rb") as file:
         return _read(file, size)
@@ -95,13 +99,13 @@ def _mapped(file: IO[bytes], size: int) -> np.ndarray:
     shape, fortran, dtype = _header(file, size)
     if math.prod(shape) == 0:
         return np.empty(shape, dtype)
-    return np.memmap(file, dtype, "r", file.tell(), shape, "F" if fortran else "C")  # type: ignore[call-overload, no-any-return]
+    return np.memmap(file, dtype, "r", file.tell(), shape, "F" if fortran else "C")
 
 
 def _read(file: IO[bytes], size: int) -> np.ndarray:
     shape, fortran, dtype = _header(file, size)
     values = np.empty(math.prod(shape), dtype)
-    here, end = memoryview(values.view(np.uint8)), 0
+    here, end = values.view(np.uint8).data, 0
     while end < len(here) and (count := file.readinto(here[end:])):  # type: ignore[attr-defined]
         end += count
     if end < len(here):

@@ -34,7 +34,9 @@ class Channels(Settings):
         if len(set(self.index)) < len(self.index):
             raise ValueError(f"index of '{cut(self.name)}' names a place twice: {shown(self.index)}")
         if self.kind in ("position", "displacement") and len(self.index) != 3:
-            raise ValueError(f"index of '{cut(self.name)}' is {shown(self.index)}, expected three places for a {self.kind}")
+            raise ValueError(
+                f"index of '{cut(self.name)}' is {shown(self.index)}, expected three places for a {self.kind}"
+            )
         return self
 
 
@@ -68,7 +70,9 @@ class Provenance(Settings):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         if (self.tracks == "estimated") != bool(self.tracker):
-            raise ValueError(f"tracks are '{self.tracks}', and the tracker is {shown(self.tracker)}; say both or neither")
+            raise ValueError(
+                f"tracks are '{self.tracks}', and the tracker is {shown(self.tracker)}; say both or neither"
+            )
         for name in ("scene", "camera", "observer", "queries"):
             _check_json(name, getattr(self, name))
         if self.action_limits is not None:

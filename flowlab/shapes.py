@@ -154,7 +154,9 @@ class _Plain:
         """Whether a value will do."""
         if self.kind is int:
             return type(value) is int or (isinstance(value, int | np.integer) and not isinstance(value, bool))
-        return isinstance(value, self.kind) and (self.of is None or all(isinstance(v, self.of) for v in value))
+        if not isinstance(value, self.kind):
+            return False
+        return self.of is None or not isinstance(value, tuple) or all(isinstance(v, self.of) for v in value)
 
 
 _Inner = tuple[str, tuple[type, ...]]

@@ -138,7 +138,9 @@ def _trial(where: str, columns: list[str], row: list[str]) -> RobotTrial:
             raise DataError(f"{where}: column '{name}' is empty; fill it in")
     solved = _SUCCESS.get(cells["success"].lower())
     if solved is None:
-        raise DataError(f"{where}: column 'success' is {shown(cells['success'])}; expected one of {', '.join(_SUCCESS)}")
+        raise DataError(
+            f"{where}: column 'success' is {shown(cells['success'])}; expected one of {', '.join(_SUCCESS)}"
+        )
     return RobotTrial(cells["policy"], cells["task"], cells["trial"], solved, cells.get(NOTE, ""))
 
 
@@ -149,7 +151,8 @@ def _by_policy(trials: Sequence[RobotTrial]) -> dict[str, dict[tuple[str, str], 
         of_policy = tried.setdefault(x.policy, {})
         if (x.task, x.trial) in of_policy:
             raise DataError(
-                f"trial {shown(x.trial)} of {cut(x.policy)} on {cut(x.task)} is scored twice, in two files; give it another name in "
+                f"trial {shown(x.trial)} of {cut(x.policy)} on {cut(x.task)} is scored twice, in two files; "
+                "give it another name in "
                 "one of them"
             )
         of_policy[x.task, x.trial] = x.success

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -116,7 +116,8 @@ def read_streams(reader: Reader, path: Path, given: Metadata) -> Streams:
         raise DataError(f"{path}: the reader '{reader.name}' cannot read it ({_words(error)})") from error
     if not isinstance(streams, Streams):
         raise DataError(f"{path}: the reader '{reader.name}' gives {shown(streams)}, expected Streams")
-    for stream in (streams.color, streams.depth, *streams.state, *streams.action):
+    every: tuple[Any, ...] = (streams.color, streams.depth, *streams.state, *streams.action)
+    for stream in every:
         _check_stream(stream, f"{path}: the reader '{reader.name}'")
     return replace(streams, color=_guarded(streams.color), depth=_guarded(streams.depth))
 

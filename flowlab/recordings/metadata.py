@@ -35,10 +35,8 @@ def _coefficients(values: tuple[float, ...]) -> tuple[float, ...]:
 def check_rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
     """Refuse rows that are no rigid transform."""
     T = np.array(rows)
-    if np.abs(T).max() < _FARTHEST_M:
-        off = np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max()
-    else:
-        off = np.inf
+    R = T[:3, :3]
+    off = np.abs(R @ R.T - np.eye(3)).max() if np.abs(T).max() < _FARTHEST_M else np.inf
     if not off < 1e-3 or np.linalg.det(T[:3, :3]) < 0 or tuple(rows[3]) != (0, 0, 0, 1):
         raise ValueError(
             "must be a rigid transform: four rows of four numbers, a rotation (determinant 1) and a position [m], "

@@ -6,7 +6,9 @@
 import faulthandler
 import os
 
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))  # which forks want
+os.environ.update(
+    dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+)  # which forks want
 import random
 import resource
 import select
@@ -77,7 +79,7 @@ def outcome(kind: Kind, folder: Path, rng: random.Random) -> str:
         return "value"
     except FlowlabError as error:
         text = str(error)
-        if len(text) > 8_200 or not text.isprintable() and "\n" not in text:
+        if len(text) > 8_200 or (not text.isprintable() and "\n" not in text):
             return "bad a sentence that is too long or not printable"
         cause = error.__cause__
         if cause is not None and "the reader '" in text and not isinstance(cause, FlowlabError):
@@ -105,7 +107,6 @@ def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, p
     os.chdir(scratch)
     os.environ.update(HOME=str(scratch), XDG_CACHE_HOME=str(scratch / "cache"), TMPDIR=str(scratch))
     tempfile.tempdir = str(scratch)
-    cv2.setNumThreads(1)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, used + _MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -136,7 +137,7 @@ def _do(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, tall
             null = os.open(os.devnull, os.O_RDWR)
             for handle in (0, 1, 2):
                 os.dup2(null, handle)
-            faulthandler.enable(open(scratch / "fault.txt", "w"))
+            faulthandler.enable(os.open(scratch / "fault.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC))
             _child(kind, sample, seed, indices, scratch, write)
             code = 0
         finally:
@@ -148,7 +149,9 @@ def _do(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, tall
     if status and last < indices.stop:
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) != signal.SIGALRM:
             name = signal.Signals(os.WTERMSIG(status)).name
-            tally.findings[f"{'hangs' if name == 'SIGKILL' else f'crashes with {name}'}: {_fault(scratch)}"].append(last)
+            tally.findings[f"{'hangs' if name == 'SIGKILL' else f'crashes with {name}'}: {_fault(scratch)}"].append(
+                last
+            )
         elif not os.WIFSIGNALED(status):
             tally.findings[f"ends the program ({os.WEXITSTATUS(status)})"].append(last)
         return last + 1
@@ -228,11 +231,14 @@ def _warm_up(kind: Kind, sample: Path, scratch: Path) -> None:
 @click.option("--keep", type=click.Path(path_type=Path), default=Path("fuzz-findings"), help="Where inputs are kept.")
 def main(seed: int, count: int, budget: float, kinds: tuple[str, ...], keep: Path) -> None:
     """Feed flowlab files that are wrong in every way; 1 where anything but a value or a sentence came of one."""
+    cv2.setNumThreads(1)  # here, for forks have no threads
     chosen = [KINDS[name] for name in kinds or KINDS]
     end, bad, total = time.monotonic() + budget, 0, 0
     shares = sum(k.share for k in chosen)
-    print(f"{'kind':<16}{'inputs':>8}{'values':>8}{'sentences':>10}{'findings':>9}{'MB':>6}{'slowest':>8}{'seconds':>8}")
-    for number, kind in enumerate(chosen):
+    print(
+        f"{'kind':<16}{'inputs':>8}{'values':>8}{'sentences':>10}{'findings':>9}{'MB':>6}{'slowest':>8}{'seconds':>8}"
+    )
+    for kind in chosen:
         left = (end - time.monotonic()) * kind.share / shares
         shares -= kind.share
         with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:

@@ -51,10 +51,8 @@ def command(*arguments: Any) -> None:
 
     from flowlab.cli import cli
 
-    try:
+    with suppress(click.ClickException, click.exceptions.Exit):
         cli.main([str(a) for a in arguments], prog_name="flowlab", standalone_mode=False)
-    except (click.ClickException, click.exceptions.Exit):
-        pass
 
 
 # Recordings
@@ -66,10 +64,8 @@ def _open(folder: Path, **settings: Any) -> None:
 
     every = RecordingSettings(max_bad_share=1.0, max_width=16, **settings)
     for path in find_recordings([folder / "r"]):
-        try:
+        with suppress(FlowlabError):
             describe(path, every)
-        except FlowlabError:
-            pass
         recording = open_recording(path, every, task="pour", seed=0)
         for t in range(len(recording)):
             recording.frame(t)
@@ -84,8 +80,10 @@ def _recording(folder: Path, rng: random.Random) -> None:
 def _plain(folder: Path) -> None:
     from real_recordings import INTRINSICS, write_folder
 
-    write_folder(folder / "r/a", steps=3, state="state.npy", action="action.csv", action_times="t.txt", task="pour",
-                 T_world_cam=np.eye(4).tolist(), intrinsics={**INTRINSICS, "distortion": [0.1, 0, 0, 0, 0]})  # fmt: skip
+    write_folder(
+        folder / "r/a", steps=3, state="state.npy", action="action.csv", action_times="t.txt", task="pour",
+        T_world_cam=np.eye(4).tolist(), intrinsics={**INTRINSICS, "distortion": [0.1, 0, 0, 0, 0]},
+    )  # fmt: skip
     np.save(folder / "r/a/state.npy", np.arange(21.0).reshape(3, 7))
     (folder / "r/a/action.csv").write_text("x,y\n" + "".join(f"{k}.5,{k}\n" for k in range(3)))
     (folder / "r/a/t.txt").write_text("0.0\n0.1\n0.2\n")
@@ -104,7 +102,8 @@ def _plain_arrays(folder: Path) -> None:
     np.save(path / "depth/0002.npy", counts(3)[2].astype(np.float32))
     np.save(path / "t.npy", np.arange(3) / 10)
     (path / "d.txt").write_text("0.0\n0.1\n0.2\n")
-    about = {"width": 32, "height": 24, "intrinsic_matrix": [30.0, 0, 0, 0, 31.0, 0, 15.2, 11.7, 1], "depth_scale": 1000.0,
+    about = {"width": 32, "height": 24, "intrinsic_matrix": [30.0, 0, 0, 0, 31.0, 0, 15.2, 11.7, 1],
+             "depth_scale": 1000.0,
              "fps": 10.0, "stream_length_usec": 300_000}  # fmt: skip
     (path / "intrinsic.json").write_text(json.dumps(about))
 
@@ -184,10 +183,8 @@ def _read_pickles(folder: Path, rng: random.Random) -> None:
     samples = [f.read_bytes() for f in sorted(folder.glob("[2-5].npy")) if f.is_file()]
     for _ in range(20):
         path.write_bytes(mutate(rng.choice(samples), "x.npy", rng))
-        try:
+        with suppress(FlowlabError):
             pickled_numbers(path, rng.choice("12345"))
-        except FlowlabError:
-            pass
 
 
 def _ros(kind: str) -> Callable[[Path], None]:
@@ -241,7 +238,7 @@ def _report_trials(folder: Path, rng: random.Random) -> None:
     from flowlab.benchmark.robot_trials import comparisons, read_robot_trials, successes
 
     trials = [trial for file in sorted(folder.glob("*.csv")) for trial in read_robot_trials(file)]
-    successes(trials), comparisons(trials)
+    repr((successes(trials), comparisons(trials)))
 
 
 def _dp3(folder: Path) -> None:
@@ -254,7 +251,7 @@ def _read_dp3(folder: Path, rng: random.Random) -> None:
     from flowlab.storage.importers.dp3 import DP3Store
 
     store = DP3Store(folder / "s.zarr")
-    store.fingerprint, store.frames
+    repr((store.fingerprint, store.frames))
     for episode in store.episodes():
         repr(episode)
 
@@ -362,7 +359,11 @@ def _setting(rng: random.Random) -> str:
     if rng.random() < 0.2:
         key += f".{nasty_text(rng)}"
     text = f"{key}={nasty_text(rng)}" if rng.random() < 0.95 else key
-    return mutate(text.encode("utf-8", "surrogatepass"), "x", rng).decode("utf-8", "surrogateescape") if rng.random() < 0.3 else text
+    return (
+        mutate(text.encode("utf-8", "surrogatepass"), "x", rng).decode("utf-8", "surrogateescape")
+        if rng.random() < 0.3
+        else text
+    )
 
 
 def _names(folder: Path, rng: random.Random) -> None:
@@ -418,7 +419,7 @@ def _windows(folder: Path) -> None:
     data = open_dataset(folder / "d")
     repr(data.episode(0))
     windows = Windows(data, {"state": [-1, 0], "point_cloud": [0], "action": range(3)}, cache=folder / "cache")
-    windows[0], windows[len(windows) - 1], windows.stats
+    repr((windows[0], windows[len(windows) - 1], windows.stats))
 
 
 def _run(name: str) -> Callable[[Path], None]:

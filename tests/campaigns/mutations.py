@@ -20,7 +20,8 @@ NASTY: tuple[Any, ...] = (
     1e-320, 1e308, -1e308, float("nan"), float("inf"), float("-inf"), "", " ", "a", "0", "1", "1e999", "nan", "-1",
     "null", "true", "../../x", "/etc/passwd", "/dev/zero", ".", "..", "a/b", "a\\b", "a\0b", "\x1b[31m", "[/red]",
     "\u202eabc", "\ud800", "é" * 300, "x" * 100_000, "os:system", "builtins:exec", "sentinel_module:Thing",
-    "sentinel_module", "!!python/object/apply:os.system", "${HOME}", "%s%n", "{0}", "<script>", "*", "&a", "rigid-bodies",
+    "sentinel_module", "!!python/object/apply:os.system", "${HOME}", "%s%n", "{0}", "<script>", "*", "&a",
+    "rigid-bodies",
     "fdp", "dp3", "mba", [], {}, [[]], [0], [None], ["a"], [1, 2, 3], [0] * 1000, [[1, 2], [3]], {"a": 1}, {"": 0},
     [float("nan")] * 3, {"a": {"b": {"c": []}}}, -(10**5), 7, 16, 64, 255, 256, 65_536, 1 << 20,
 )  # fmt: skip
@@ -28,8 +29,9 @@ NASTY: tuple[Any, ...] = (
 _INTEGERS = (0, 1, 2, 7, 255, 256, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 _SHAPES = (
     "()", "(0,)", "(-1,)", "(1,)", "(2, 8)", "(2, 8, 8)", "(2, 8, 8, 3)", "(10**20,)", "(100000000000000000000,)",
-    "(1000000000000, 0)", "(0, 3)", "(2.5,)", "('a',)", "None", "[2]", "(True, 2)", "(4294967296, 4294967296)", "(" * 300,
-    "(1,)*99", "2", "{}", "(1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1)",
+    "(1000000000000, 0)", "(0, 3)", "(2.5,)", "('a',)", "None", "[2]", "(True, 2)", "(4294967296, 4294967296)",
+    "(" * 300, "(1,)*99", "2", "{}",
+    "(1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1)",
 )  # fmt: skip
 _TYPES = (
     "'<f4'", "'<f8'", "'>f8'", "'|u1'", "'<u2'", "'|b1'", "'|O'", "'<U8'", "'|S8'", "'<M8[s]'", "'<c16'", "'|V0'",
@@ -246,11 +248,14 @@ def _mutate_pickle(content: bytes, rng: random.Random) -> bytes:
         at = rng.randrange(len(body))
         how = rng.randrange(5)
         if how == 0:
-            body[at] = rng.choice(b"()]}0125BCGIJKLMNRSTUVX\x80\x81\x82\x85\x86\x87\x88\x89\x8a\x8c\x8e\x93\x94\x95bcdehijlopqrstu.")
+            body[at] = rng.choice(
+                b"()]}0125BCGIJKLMNRSTUVX\x80\x81\x82\x85\x86\x87\x88\x89\x8a\x8c\x8e\x93\x94\x95bcdehijlopqrstu."
+            )
         elif how == 1:
             body[at:at] = rng.choice(
-                (b"cos\nsystem\n(S'touch pwned'\ntR", b"cbuiltins\nexec\n", b"R", b"b", b"0", b"2", b"(", b"t", b"N",
-                 b"j\xff\xff\xff\x7f", b"r\xff\xff\xff\x7f", b"\x8b\xff\xff\xff\x7f", b"cnumpy\ndtype\n", b"}", b"]", b")")
+                (b"cos\nsystem\n(S'touch pwned'\ntR", b"cbuiltins\nexec\n", b"cnumpy\ndtype\n", b"j\xff\xff\xff\x7f",
+                 b"r\xff\xff\xff\x7f", b"\x8b\xff\xff\xff\x7f", b"R", b"b", b"0", b"2", b"(", b"t", b"N",
+                 b"}", b"]", b")")
             )  # fmt: skip
         else:
             body = bytearray(_mutate_bytes(bytes(body), rng)) or bytearray(b".")
@@ -265,7 +270,9 @@ def _mutate_zip(content: bytes, rng: random.Random) -> bytes:
     if how < 3:
         members[name] = mutate(members[name], name, rng)
     elif how == 3:
-        members[rng.choice(("../../x.npy", "/x.npy", "a\\b.npy", "x", "", "\x1b.npy", "rgb.npy", "depth.npy"))] = members.pop(name)
+        members[rng.choice(("../../x.npy", "/x.npy", "a\\b.npy", "x", "", "\x1b.npy", "rgb.npy", "depth.npy"))] = (
+            members.pop(name)
+        )
     elif how == 4:
         members[name] = bytes(rng.choice((0, 10, 1 << 20, 30 << 20)))
     else:
@@ -291,8 +298,8 @@ def _mutate_png(content: bytes, rng: random.Random) -> bytes:
     elif how == 2 and chunk[1]:
         chunk[1][rng.randrange(len(chunk[1]))] ^= 1 << rng.randrange(8)
     elif how == 3:
-        chunks.insert(rng.randrange(len(chunks) + 1), [rng.choice((b"acTL", b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"IHDR")),
-                                                       bytearray(rng.randbytes(rng.randrange(30)))])  # fmt: skip
+        kind = rng.choice((b"acTL", b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"IHDR"))
+        chunks.insert(rng.randrange(len(chunks) + 1), [kind, bytearray(rng.randbytes(rng.randrange(30)))])
     else:
         chunks.remove(chunk)
     parts = [len(d).to_bytes(4, "big") + k + bytes(d) + zlib.crc32(k + bytes(d)).to_bytes(4, "big") for k, d in chunks]

@@ -11,8 +11,8 @@ _CHANGES = {
     "shutil.rmtree", "shutil.move", "shutil.copyfile",
 }  # fmt: skip
 _STARTS = {
-    "subprocess.Popen", "os.exec", "os.system", "os.posix_spawn", "os.fork", "os.forkpty", "pty.spawn", "socket.connect",
-    "ctypes.dlopen",
+    "subprocess.Popen", "os.exec", "os.system", "os.posix_spawn", "os.fork", "os.forkpty", "pty.spawn",
+    "socket.connect", "ctypes.dlopen",
 }  # fmt: skip
 _HARMLESS = ("/dev/null", "/dev/tty", "/proc/self/", "/dev/shm/")
 

@@ -144,7 +144,7 @@ class Evil:
     [
         ("intrinsics.npy", b"broken", r"intrinsics\.npy: cannot be read"),
         ("extrinsics.npy", Evil(), r"extrinsics\.npy: cannot be read \(it asks for builtins\.exec\)"),
-        ("intrinsics.npy", [1, 2], "holds a list\); expected a mapping"),
+        ("intrinsics.npy", [1, 2], r"holds a list\); expected a mapping"),
     ],
 )
 def test_a_calibration_is_read_without_trust(

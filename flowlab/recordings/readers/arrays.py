@@ -110,7 +110,9 @@ def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.nd
     if ends is not None and np.size(ends) > 1:
         raise DataError(f"{path}: holds {np.size(ends)} episodes, one after the other; write one file per episode")
     if color.ndim != 4 or 3 not in (color.shape[-1], color.shape[1]):
-        raise DataError(f"{path}: '{names['color']}' has the shape {cut(str(color.shape))}, expected (steps, height, width, 3)")
+        raise DataError(
+            f"{path}: '{names['color']}' has the shape {cut(str(color.shape))}, expected (steps, height, width, 3)"
+        )
     if color.dtype != np.uint8:
         raise DataError(f"{path}: '{names['color']}' has the type {color.dtype}, expected uint8, 0 to 255, RGB")
     if depth.ndim not in (3, 4) or len(color) != len(depth):
@@ -137,7 +139,8 @@ def _times(store: _Store, steps: int, given: Metadata) -> np.ndarray:
     time_s = store.load("time")
     if time_s is not None:
         if time_s.shape != (steps,) or time_s.dtype.kind not in "iuf":
-            raise DataError(f"{store.path}: '{store.names['time']}' is {time_s.dtype} {cut(str(time_s.shape))}, expected numbers ({steps},)")
+            found = f"{time_s.dtype} {cut(str(time_s.shape))}"
+            raise DataError(f"{store.path}: '{store.names['time']}' is {found}, expected numbers ({steps},)")
         return check_times(store.path, np.asarray(time_s, np.float64))
     if given.fps is None:
         where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name

@@ -107,7 +107,9 @@ def _timed(folder: Path, suffixes: Sequence[str], stop_s: float = np.inf) -> tup
     files = list_images(folder, suffixes)
     strangers = [f.name for f in files if not (f.stem.isascii() and f.stem.isdecimal() and len(f.stem) < 16)]
     if strangers:
-        raise DataError(f"{folder}: {shown(strangers[0])} is not named by its time in milliseconds, as RH20T's files are")
+        raise DataError(
+            f"{folder}: {shown(strangers[0])} is not named by its time in milliseconds, as RH20T's files are"
+        )
     kept = [f for f in files if int(f.stem) / 1000 <= stop_s]
     return kept, np.array([int(f.stem) / 1000 for f in kept])
 

@@ -104,10 +104,13 @@ def check_attributes(folder: Path) -> None:
 
 def _lengths(file: Path, name: str, about: dict[str, Any], least: int) -> tuple[int, ...]:
     found = about.get(name)
-    is_shape = isinstance(found, list) and all(type(n) is int and least <= n < 1 << 62 for n in found)
-    if not is_shape or len(found) > _MOST_DIMENSIONS:
-        raise DataError(f"{file}: '{name}' is {shown(found)}, expected whole numbers from {least} on; {_REDO}")
-    return tuple(found)
+    if isinstance(found, list) and len(found) <= _MOST_DIMENSIONS and all(_is_length(n, least) for n in found):
+        return tuple(found)
+    raise DataError(f"{file}: '{name}' is {shown(found)}, expected whole numbers from {least} on; {_REDO}")
+
+
+def _is_length(value: Any, least: int) -> bool:
+    return type(value) is int and least <= value < 1 << 62
 
 
 def _separator(file: Path, about: dict[str, Any]) -> str:
