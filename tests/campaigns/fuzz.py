@@ -215,7 +215,10 @@ def _warm_up(kind: Kind, sample: Path, scratch: Path) -> None:
     """Have everything imported and compiled before children are forked, and see that the sample is a good one."""
     import matplotlib.font_manager  # which looks for fonts by a program of its own
 
+    from flowlab.pipeline.recipe import load_recipe
+
     assert matplotlib
+    load_recipe("metaworld").pipeline().provenance("push")  # which opens the simulator, and its libraries
     shutil.copytree(sample, scratch / "case")
     for k in range(3):
         found = outcome(kind, scratch / "case", case_rng(0, kind.name, k))

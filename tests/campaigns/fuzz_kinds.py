@@ -175,13 +175,13 @@ def _pickle(folder: Path) -> None:
 
 
 def _read_pickles(folder: Path, rng: random.Random) -> None:
-    """Twenty of them at a time, for they are quick."""
+    """Two hundred of them at a time, for they are quick."""
     from flowlab.errors import FlowlabError
     from flowlab.recordings.readers.safe_pickle import pickled_numbers
 
     path = folder / "case.npy"
     samples = [f.read_bytes() for f in sorted(folder.glob("[2-5].npy")) if f.is_file()]
-    for _ in range(20):
+    for _ in range(200):
         path.write_bytes(mutate(rng.choice(samples), "x.npy", rng))
         with suppress(FlowlabError):
             pickled_numbers(path, rng.choice("12345"))

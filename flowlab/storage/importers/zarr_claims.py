@@ -73,8 +73,11 @@ class ArrayClaim:
         size = check_regular(file, 2 * self.chunk_bytes + (1 << 16))
         unpacked = size
         if self.is_compressed:
-            with file.open("rb") as chunk:
-                header = chunk.read(_BLOSC_HEADER)
+            try:
+                with file.open("rb") as chunk:
+                    header = chunk.read(_BLOSC_HEADER)
+            except OSError as error:
+                raise DataError(f"{file}: cannot be read ({error.strerror or error}); {_REDO}") from error
             unpacked = int.from_bytes(header[4:8], "little") if len(header) == _BLOSC_HEADER else 0
         if unpacked != self.chunk_bytes:
             raise DataError(
