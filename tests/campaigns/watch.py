@@ -38,7 +38,7 @@ class Watch:
             for path in arguments[:2]:
                 if isinstance(path, str | bytes | os.PathLike) and not self._is_inside(path):
                     self._add(f"{event} {path}")
-        elif event in _STARTS and arguments != (None,):  # as which ctypes opens the program itself
+        elif event in _STARTS and not (event == "ctypes.dlopen" and _is_installed(arguments[0])):
             self._add(f"{event} {str(arguments)[:200]}")
         elif event == "exec" and str(getattr(arguments[0], "co_filename", "")).startswith(self.inside):
             self._add(f"ran {arguments[0].co_filename}")
@@ -51,3 +51,8 @@ class Watch:
         self.armed = False  # what is noted must not be noted itself
         self.seen.append(what)
         self.armed = True
+
+
+def _is_installed(library: Any) -> bool:
+    """Whether a library is the program itself, or one of the packages'."""
+    return library is None or "site-packages" in str(library)
