@@ -101,7 +101,7 @@ def _place(error: BaseException) -> str:
     return f"{where} {type(error).__name__}{raised}: {str(error)[:80]!r}"
 
 
-def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, pipe: int) -> None:
+def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, pipe: int, end: float) -> None:
     """Do some inputs, and tell what came of each through a pipe."""
     watch = Watch(scratch)
     os.chdir(scratch)
@@ -112,6 +112,8 @@ def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, p
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for index in indices:
+        if time.monotonic() > end:
+            return
         os.write(pipe, f"{index} begin\n".encode())
         rng = prepare(kind, sample, seed, index, scratch / "case")
         start, watch.armed = time.perf_counter(), True
@@ -125,7 +127,7 @@ def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, p
         os.write(pipe, f"{index} end {took:.3f} {peak:.0f} {found!a}\n".encode()[:4000])
 
 
-def _do(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, tally: Tally) -> int:
+def _do(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, tally: Tally, end: float) -> int:
     """Fork a child for some inputs; the index after the last that was done."""
     read, write = os.pipe()
     sys.stdout.flush()
@@ -138,7 +140,7 @@ def _do(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, tall
             for handle in (0, 1, 2):
                 os.dup2(null, handle)
             faulthandler.enable(os.open(scratch / "fault.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC))
-            _child(kind, sample, seed, indices, scratch, write)
+            _child(kind, sample, seed, indices, scratch, write, end)
             code = 0
         finally:
             os._exit(code)
@@ -206,7 +208,7 @@ def fuzz_kind(kind: Kind, seed: int, count: int, seconds: float, scratch: Path) 
     kind.make(sample)
     _warm_up(kind, sample, scratch)
     while at < count and time.monotonic() - start < seconds:
-        at = _do(kind, sample, seed, range(at, min(count, at + _A_CHILD_DOES)), scratch, tally)
+        at = _do(kind, sample, seed, range(at, min(count, at + _A_CHILD_DOES)), scratch, tally, start + seconds)
     tally.seconds = time.monotonic() - start
     return tally
 
