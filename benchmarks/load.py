@@ -3,9 +3,9 @@
     python benchmarks/load.py                    # 2,000 units, three minutes
     python benchmarks/load.py --units 500 --json FILE
 
-A few episodes are simulated, and repeated under other seeds until there are enough units. Then are timed: `validate`, the
-first start of a training (its decoded arrays and its normalizer), and reading everything with zarr alone from the folders
-that shards were before schema version 2. Times are CPU time of this process, memory is its peak.
+A few episodes are simulated, and repeated under other seeds until there are enough units. Then are timed: `validate`,
+the first start of a training (its decoded arrays and its normalizer), and reading everything with zarr alone from the
+folders that shards were before schema version 2. Times are CPU time of this process, memory is its peak.
 """
 
 import os

@@ -80,6 +80,7 @@ def main(*args: Any) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show is escaped
+    asked = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"  # of Pythons that libraries start: nothing of the current folder is imported
     try:
         _check_folder()
@@ -97,3 +98,6 @@ def main(*args: Any) -> None:
     except (KeyboardInterrupt, click.Abort):
         click.echo("\nflowlab: interrupted; what was finished is kept, the same command does the rest", err=True)
         sys.exit(130)
+    finally:
+        if asked is None:
+            del os.environ["PYTHONSAFEPATH"]

@@ -13,6 +13,7 @@ import pytest
 import zarr
 from conftest import Cli
 from synthetic import call_cli, make_manifest
+from zarr.storage import ZipStore
 
 import flowlab as package
 from flowlab.storage.dataset import Dataset, begin
@@ -145,7 +146,7 @@ def test_info_says_what_the_shards_hold(small_dataset: Path, flowlab: Cli) -> No
         "tasks", "arrays", "stages", "stats", "settings", "provenance",
     }  # fmt: skip
     ends = {
-        p.name: np.asarray(zarr.open_group(p, mode="r")["meta/episode_ends"])
+        p.name: np.asarray(zarr.open_group(ZipStore(p, mode="r"), mode="r")["meta/episode_ends"])
         for p in (small_dataset / "shards").iterdir()
     }
     assert info["episodes"] == sum(map(len, ends.values())) == 6

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from synthetic import SETTINGS, call_cli, make_dataset, make_episode
+from synthetic import SETTINGS, call_cli, make_dataset, make_episode, put_unit
 from trained_runs import (
     SMALL,
     header_of,
@@ -40,7 +40,6 @@ from flowlab.errors import DataError
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.shard import write_shard
 from flowlab.training import run as training_run
 from flowlab.training.trainer import Trainer
 
@@ -284,7 +283,7 @@ def test_data_that_are_no_numbers_end_a_run(tmp_path: Path, capsys: Capture) -> 
     state[7, 2] = np.nan
     (receipt,) = dataset.receipts
     episodes[6] = replace(episodes[6], state=state)
-    write_shard(tmp_path / "d" / receipt.shard, episodes, dataset.manifest.settings_digest)
+    put_unit(tmp_path / "d", episodes, dataset.manifest.settings_digest, stats=receipt.stats)
     small = (*SMALL, *options("batch.windows=4", "run.steps=60", "run.checkpoints=60", "run.validations=0"))
     code, out, err = call_cli(capsys, "train", tmp_path / "d", "--policy", "fdp", "--out", tmp_path / "run", *small)
     assert (code, out) == (1, "")

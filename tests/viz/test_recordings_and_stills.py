@@ -17,14 +17,15 @@ from synthetic import (
     make_episode,
     make_filmed_episode,
     make_manifest,
-    make_receipt,
+    put_unit,
 )
 
+from flowlab.checksums import sha256_of
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
 from flowlab.storage.dataset import begin
-from flowlab.storage.receipts import Reject, keep_receipt
+from flowlab.storage.receipts import Reject, shard_path
 from flowlab.storage.shard import write_shard
 from flowlab.viz.blueprint import make_blueprint
 from flowlab.viz.captions import caption, describe, moving
@@ -440,10 +441,10 @@ def pours(tmp_path: Path) -> Path:
         Reject(task="pour", seed=4, stage="recording", reason="no frame is whole"),
         Reject(task="pour", seed=5, stage="quality", reason="too unsure", position=0),
     )
-    receipt = make_receipt([make_filmed_episode()], seeds=(3, 4, 5), rejects=rejects)
-    write_shard(folder / receipt.shard, [make_filmed_episode()], manifest.settings_digest)
-    write_shard(folder / receipt.rejects_shard, [make_filmed_episode(seed=5)], manifest.settings_digest)
-    keep_receipt(folder, receipt)
+    kept = folder / shard_path("rejects", "pour-000003-000003")
+    write_shard(kept, [make_filmed_episode(seed=5)], manifest.settings_digest)
+    known = {"seeds": (3, 4, 5), "rejects": rejects, "rejects_sha256": sha256_of(kept)}
+    put_unit(folder, [make_filmed_episode()], manifest.settings_digest, **known)
     return folder
 
 
