@@ -87,7 +87,9 @@ def read_lines(path: Path, expected: str, advice: str) -> Iterator[tuple[int, An
     """
     *whole, _ = (read_bytes(path) if path.exists() else b"").split(b"\n")
     for number, line in enumerate(whole, 1):
-        where = f"{path}: line {number} is damaged (expected {expected}, found {shown(line[:60].decode(errors='replace'))})"
+        where = (
+            f"{path}: line {number} is damaged (expected {expected}, found {shown(line[:60].decode(errors='replace'))})"
+        )
         try:
             yield number, unseal(parse_json(line, where), where, advice)
         except DataError as error:

@@ -18,3 +18,5 @@ MAX_LOADED_BYTES = 1 << 30
 """Of an array that is read into memory at once."""
 MAX_SHOWN = 200
 """Characters of a value that an error shows."""
+MAX_WIDTH = 100_000
+"""Numbers of a state or an action."""

@@ -17,7 +17,6 @@ settings.register_profile("flowlab", max_examples=examples(100), deadline=None)
 settings.load_profile("flowlab")
 
 
-
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Decoded datasets of tests lie in a cache of their own, in other processes too."""

@@ -76,7 +76,7 @@ def cached_part(source: TrainingSource, fallback: Path | None, part: str, arrays
         DataError: No folder can be written, or the episodes are of different widths.
     """
     content = f"{source.cache_key}-{_FORMAT}"
-    problems = []
+    problems: list[str] = []
     for cache in _places(fallback, problems):
         try:
             with _alone(cache / content) as folder:

@@ -35,6 +35,11 @@ class Scale(Settings):
         unit = np.where(hi - lo < _STILL, 1.0, (hi - lo) / 2)
         return cls(offset=tuple(((lo + hi) / 2).tolist()), unit=tuple(unit.tolist()))
 
+    def fits(self, width: int) -> bool:
+        """Whether it is for so many channels, and can be undone."""
+        numbers = np.isfinite([*self.offset, *self.unit]).all() and all(u > 0 for u in self.unit)
+        return bool(len(self.offset) == len(self.unit) == width and numbers)
+
 
 class Normalizer(Settings):
     """The scales of a dataset. Lengths have one unit for all axes, so that shapes keep their proportions."""
@@ -82,9 +87,7 @@ def _isotropic(scale: Scale, limits: tuple[Limits, Limits], channels: tuple[int,
     return Scale(offset=tuple(offset.tolist()), unit=tuple(unit.tolist()))
 
 
-def _limits(
-    values: Float[np.ndarray, "F *N C"], name: str
-) -> tuple[Float[np.ndarray, "C"], Float[np.ndarray, "C"]]:
+def _limits(values: Float[np.ndarray, "F *N C"], name: str) -> tuple[Float[np.ndarray, "C"], Float[np.ndarray, "C"]]:
     """Least and greatest value of every channel."""
     rows = values.reshape(len(values), -1)  # long rows are looked at many times as fast as short ones
     low, high = (limit.reshape(-1, values.shape[-1]) for limit in (rows.min(0), rows.max(0)))

@@ -125,7 +125,5 @@ def read_evaluations(run: Path) -> list[CheckpointEvaluation]:
         step, n_action_steps = map(int, name.groups())
         outcomes = sorted(read_results(folder / EPISODES).values(), key=lambda o: o.trial)
         if outcomes:
-            found.append(
-                CheckpointEvaluation(step=step, n_action_steps=n_action_steps, outcomes=tuple(outcomes))
-            )
+            found.append(CheckpointEvaluation(step=step, n_action_steps=n_action_steps, outcomes=tuple(outcomes)))
     return found

@@ -34,8 +34,6 @@ def read_results(path: Path) -> dict[Trial, EpisodeResult]:
         try:
             result = EpisodeResult.model_validate(migrate_episode(values))
         except ValidationError as error:
-            raise DataError(
-                f"{path}: line {number} is damaged ({explain(error, EpisodeResult)}); {_ADVICE}"
-            ) from error
+            raise DataError(f"{path}: line {number} is damaged ({explain(error, EpisodeResult)}); {_ADVICE}") from error
         found[result.trial] = result
     return found

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,9 +24,9 @@ from flowlab.files import check_inside, new_file, remove_leftovers, write_json
 from flowlab.json_lines import DIGEST, seal, unseal
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
+from flowlab.registry import names_from_file
 from flowlab.storage.manifest import differences
 from flowlab.text import shown
-from flowlab.registry import names_from_file
 from flowlab.untrusted import parse_json, read_json
 from flowlab.version import __version__
 
@@ -141,6 +142,12 @@ def step_of(weights: Path) -> int:
     """Training steps that a checkpoint has seen. Raises :class:`DataError` where it is damaged."""
     with _understood(weights, _ADVICE), safetensors.safe_open(weights, "pt") as file:
         return int(_metadata(file, str(weights), _ADVICE)["step"])
+
+
+def count_weights(weights: Path) -> int:
+    """How many numbers a checkpoint holds. Raises :class:`DataError` where it is damaged."""
+    with _understood(weights, _ADVICE), safetensors.safe_open(weights, "pt") as file:
+        return sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - no mapping
 
 
 def read_trained(folder: Path) -> TrainedPolicy:

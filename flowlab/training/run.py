@@ -21,6 +21,7 @@ from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (
+    RUN,
     RunConfig,
     TrainedPolicy,
     check_observer,
@@ -130,16 +131,14 @@ def prepare_run(
     return trainer
 
 
-def _check_same(
-    data: Path, out: Path, settings: TrainSettings, overfit: int | None, began_from: Path | None
-) -> None:
+def _check_same(data: Path, out: Path, settings: TrainSettings, overfit: int | None, began_from: Path | None) -> None:
     """Raises :class:`UsageError` where the run of a folder was begun in another way."""
     began, trained = read_run_config(out), read_trained(out)
     asked = {"dataset": str(data.resolve()), "overfit": overfit, "from": began_from and str(began_from)}
     found = {"dataset": str(began.dataset), "overfit": began.overfit, "from": began.began_from}
-    plain = [json.loads(s.model_dump_json()) for s in (trained.policy.settings, settings)]
+    old, new = (json.loads(s.model_dump_json()) for s in (trained.policy.settings, settings))
     owners = ("the run", "this command")
-    if lines := [*differences(found, asked, "run", owners=owners), *differences(*plain, "settings", owners=owners)]:
+    if lines := [*differences(found, asked, "run", owners=owners), *differences(old, new, "settings", owners=owners)]:
         raise UsageError(
             f"{out}: holds a run already, which began in another way; choose another --out, or go on with it by "
             f"'flowlab train {out} --resume':\n  " + "\n  ".join(lines)
@@ -166,6 +165,10 @@ def resume_run(
     with names_from_file(but=logs or ()):
         check_loggers(config.logs)
     processes = ProcessGroup(config.device, config.threads, config.precision)
+    if not config.dataset.exists():
+        raise DataError(
+            f"{folder}: its dataset is no longer at {config.dataset}; restore it, or change 'dataset' in {folder / RUN}"
+        )
     source = open_training_source(config.dataset)
     check_observer(trained, folder, source)
     if source.fingerprint != trained.fingerprint:

@@ -29,7 +29,7 @@ def open_both(folder: Path, episodes: list[Episode]) -> tuple[TrainingSource, Re
 
 
 def fitted(folder: Path, episodes: list[Episode], *overrides: str, layout: ChannelSpec | None = None) -> Normalizer:
-    source, buffer = open_both(folder, episodes)
+    _, buffer = open_both(folder, episodes)
     return fit_normalizer(buffer, layout or ChannelSpec(), tiny_settings("fdp", *overrides))
 
 
@@ -56,7 +56,7 @@ def test_where_scenes_are_turned_displacements_are_alike_in_all_directions(tmp_p
 
     episodes = [narrow(make_episode(k)) for k in range(3)]
     layout = ChannelSpec(gripper=FIRST, state_positions=(FIRST,), action_displacement=FIRST)
-    source, buffer = open_both(tmp_path / "d", episodes)
+    _, buffer = open_both(tmp_path / "d", episodes)
     plain, turned = (
         fit_normalizer(buffer, layout, tiny_settings("fdp", f"batch.turn_deg={d}")).action for d in (0, 30)
     )

@@ -273,7 +273,10 @@ def files_no_larger_than(size: int) -> Iterator[None]:
 def test_a_disk_without_room_is_one_sentence(tmp_path: Path, cache: Path) -> None:
     episodes = make_episodes()
     source = write(tmp_path / "d", episodes)
-    with files_no_larger_than(20_000), pytest.raises(DataError, match=r"cannot be written \(File too large\); .*make room"):
+    with (
+        files_no_larger_than(20_000),
+        pytest.raises(DataError, match=r"cannot be written \(File too large\); .*make room"),
+    ):
         load_buffer(source, tmp_path / "run")
     assert decoded(cache) == []
     check(load_buffer(source, tmp_path / "run"), episodes)

@@ -39,8 +39,8 @@ from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
 from flowlab.data.window_sampler import index_windows
 from flowlab.errors import DataError
-from flowlab.policies.base import PolicyNetwork
 from flowlab.json_lines import seal
+from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import RESUME, load_policy
 from flowlab.storage.dataset import Dataset
 from flowlab.training import run as training_run
