@@ -21,7 +21,7 @@ from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.files import check_inside, new_file, remove_leftovers, write_json
-from flowlab.json_lines import DIGEST, seal, unseal
+from flowlab.json_lines import DIGEST, json_digest, seal, unseal
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
 from flowlab.registry import names_from_file
@@ -196,14 +196,14 @@ def save_weights(folder: Path, policy: PolicyNetwork, step: int) -> Path:
         check_inside(folder, path.parent)
         path.parent.mkdir(exist_ok=True)
         remove_leftovers(path.parent)
-        _write(path, policy.state_dict(), {"step": step, "policy": _digest_in(folder / POLICY)})
+        _write(path, policy.state_dict(), {"step": step, "policy": _identity_in(folder / POLICY)})
     return path
 
 
 def save_resume(folder: Path, step: int, groups: Groups) -> None:
     """Keep everything that goes on changing: named groups of tensors, as they are after ``step`` steps."""
     with writing_run(folder):
-        _write_resume(folder, step, groups, _digest_in(folder / POLICY), _digest_in(folder / RUN, _FREE))
+        _write_resume(folder, step, groups, _identity_in(folder / POLICY), _identity_in(folder / RUN))
 
 
 def read_resume(folder: Path) -> tuple[int, Groups]:
@@ -266,7 +266,7 @@ def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig, groups: G
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
         (folder / POLICY).unlink(missing_ok=True)
-        _write_resume(folder, 0, groups, about[DIGEST], plan[DIGEST])
+        _write_resume(folder, 0, groups, _identity(about), _identity(plan))
         write_json(folder / RUN, plan)
         write_json(folder / POLICY, about)
 
@@ -293,9 +293,13 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _digest_in(path: Path, free: tuple[str, ...] = ()) -> str:
-    """The digest of a run's JSON file, of one from an earlier version too."""
-    return str(seal(unseal(read_json(path), str(path), _RESTORE, free), free)[DIGEST])
+def _identity(values: Mapping[str, Any]) -> str:
+    """Identifies what ``policy.json`` or ``run.json`` says, wherever the dataset is, for the weights beside it."""
+    return json_digest({k: v for k, v in values.items() if k not in (*_FREE, DIGEST)})
+
+
+def _identity_in(path: Path) -> str:
+    return _identity(read_json(path, _RESTORE))
 
 
 def _read(path: Path, run: Path, advice: str) -> tuple[dict[str, Tensor], int]:
@@ -307,9 +311,8 @@ def _read(path: Path, run: Path, advice: str) -> tuple[dict[str, Tensor], int]:
         tensors, step = load_file(path), int(about["step"])
     if "tensors" in about and _digest(tensors) != about["tensors"]:
         raise DataError(f"{path}: damaged (its digest is another than its content's); {advice}")
-    for name, free in (("policy", ()), ("run", _FREE)):
-        other = run / f"{name}.json"
-        if name in about and about[name] != _digest_in(other, free):
+    for name, other in (("policy", run / POLICY), ("run", run / RUN)):
+        if name in about and about[name] != _identity_in(other):
             raise DataError(f"{path}: was saved beside another {other.name} than {other}; restore both from one run")
     return {migrate_tensor(name) if old else name: value for name, value in tensors.items()}, step
 

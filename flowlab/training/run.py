@@ -73,10 +73,10 @@ def begin_run(
     """
     if not has_begun(out):
         return prepare_run(data, out, settings, compute, overfit=overfit, began_from=began_from)
-    _check_same(data, out, settings, overfit, began_from)
+    _check_same(out, settings, overfit, began_from)
     device = None if compute.device == "auto" else compute.device
     precision = None if compute.precision == "auto" else compute.precision
-    return resume_run(out, device=device, threads=compute.threads, precision=precision, logs=compute.logs)
+    return resume_run(out, data, device=device, threads=compute.threads, precision=precision, logs=compute.logs)
 
 
 def prepare_run(
@@ -131,11 +131,11 @@ def prepare_run(
     return trainer
 
 
-def _check_same(data: Path, out: Path, settings: TrainSettings, overfit: int | None, began_from: Path | None) -> None:
+def _check_same(out: Path, settings: TrainSettings, overfit: int | None, began_from: Path | None) -> None:
     """Raises :class:`UsageError` where the run of a folder was begun in another way."""
     began, trained = read_run_config(out), read_trained(out)
-    asked = {"dataset": str(data.resolve()), "overfit": overfit, "from": began_from and str(began_from)}
-    found = {"dataset": str(began.dataset), "overfit": began.overfit, "from": began.began_from}
+    asked = {"overfit": overfit, "from": began_from and str(began_from)}
+    found = {"overfit": began.overfit, "from": began.began_from}
     old, new = (json.loads(s.model_dump_json()) for s in (trained.policy.settings, settings))
     owners = ("the run", "this command")
     if lines := [*differences(found, asked, "run", owners=owners), *differences(old, new, "settings", owners=owners)]:
@@ -147,6 +147,7 @@ def _check_same(data: Path, out: Path, settings: TrainSettings, overfit: int | N
 
 def resume_run(
     folder: Path,
+    data: Path | None = None,
     *,
     device: str | None = None,
     threads: int | None = None,
@@ -154,13 +155,19 @@ def resume_run(
     logs: Sequence[str] | None = None,
 ) -> Trainer:
     """A run that ended early, as it was after the last step that was saved; it computes on what it did, but for what
-    is given.
+    is given. ``data`` is where its dataset is, if it has moved.
 
     Raises:
         DataError: The dataset is no longer what the run began with, or there is nothing to resume.
     """
     trained, began = read_trained(folder), read_run_config(folder)
-    given = {"device": device, "threads": threads, "precision": precision, "logs": None if logs is None else (*logs,)}
+    given = {
+        "dataset": None if data is None else data.resolve(),
+        "device": device,
+        "threads": threads,
+        "precision": precision,
+        "logs": None if logs is None else (*logs,),
+    }
     config = began.model_copy(update={k: v for k, v in given.items() if v is not None})
     with names_from_file(but=logs or ()):
         check_loggers(config.logs)
