@@ -13,8 +13,6 @@ from synthetic import SETTINGS, call_cli, files_below, make_dataset, make_episod
 from trained_runs import (
     NETWORK,
     SMALL,
-    header_of,
-    step_in,
     leftovers,
     lines_of,
     make_recorded,
@@ -22,6 +20,7 @@ from trained_runs import (
     make_run,
     options,
     policy_of,
+    step_in,
     train,
     weights_of,
 )
@@ -346,7 +345,7 @@ def test_a_run_is_not_overwritten(rolls: Path, taught: Path, tmp_path: Path, cap
     command = ("train", rolls, "--policy", "dp3", "--out", tmp_path / "run", *SMALL, "--seed", "5")
     code, out, err = call_cli(capsys, *command)
     assert (code, out) == (2, "")
-    assert f"run: holds a run already, which began in another way; choose another --out, or go on with it by" in err
+    assert "run: holds a run already, which began in another way; choose another --out, or go on with it by" in err
     assert files_below(tmp_path) == before
 
 
