@@ -26,11 +26,16 @@ def remove_leftovers(folder: Path) -> None:
         pid = leftover.name.removeprefix(_prefix()).partition("+")[0]
         if not (pid.isascii() and pid.isdecimal()) or is_running(int(pid)):
             continue
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover, ignore_errors=True)
-        else:
-            with suppress(OSError):
-                leftover.unlink(missing_ok=True)
+        _remove(leftover)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file, a folder, or a link and not what it leads to, as far as this is possible."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -48,13 +53,14 @@ def new_folder(path: Path) -> Iterator[Path]:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             remove_leftovers(path.parent)
+            _remove(temporary)
             temporary.mkdir()
             yield temporary
             sync_tree(temporary)
             os.rename(temporary, path)
             sync_folder(path.parent)
         finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+            _remove(temporary)
 
 
 @contextmanager
@@ -68,14 +74,15 @@ def new_file(path: Path) -> Iterator[Path]:
         OSError: It cannot be written.
     """
     temporary = temporary_path(path)
+    _remove(temporary)
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # a new file, and no link to another
     try:
         yield temporary
         _sync(temporary)
         os.replace(temporary, path)
         sync_folder(path.parent)
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        _remove(temporary)
 
 
 @contextmanager

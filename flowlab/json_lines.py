@@ -1,52 +1,23 @@
-"""JSON that tells its own digest, so that a byte that changed on disk is found, and files with such a line for each
-event, which several processes may add to."""
+"""Files with a line of JSON for each event, which several processes may add to; each line has a checksum."""
 
 import fcntl
-import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from flowlab.checksums import with_checksum, without_checksum
 from flowlab.errors import DataError
 from flowlab.files import told_when_unwritable
 from flowlab.text import shown
 from flowlab.untrusted import parse_json, read_bytes
 
-DIGEST = "digest"
-"""Key that is added to what is kept."""
-
-
-def json_digest(values: Any) -> str:
-    """Identifies JSON values, in whatever order and layout they are written."""
-    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def seal(values: Mapping[str, Any], free: Sequence[str] = ()) -> dict[str, Any]:
-    """Values with their digest, in which the keys ``free`` do not count: people may change these."""
-    return {**values, DIGEST: json_digest({k: v for k, v in values.items() if k not in free})}
-
-
-def unseal(values: Any, where: str, advice: str, free: Sequence[str] = ()) -> Any:
-    """The values without their digest; those of earlier versions, which have none, as they are.
-
-    Raises:
-        DataError: Something in them is no longer as it was written.
-    """
-    if not isinstance(values, dict) or DIGEST not in values:
-        return values
-    plain = {k: v for k, v in values.items() if k != DIGEST}
-    if seal(plain, free)[DIGEST] != values[DIGEST]:
-        raise DataError(f"{where}: damaged or changed by hand (its digest is another than its content's); {advice}")
-    return plain
-
 
 def line_of(values: Mapping[str, Any]) -> bytes:
-    """Values as a line with its digest."""
-    return json.dumps(seal(values)).encode() + b"\n"
+    """Values as a line with its checksum."""
+    return json.dumps(with_checksum(values)).encode() + b"\n"
 
 
 def append_line(path: Path, values: Mapping[str, Any], advice: str) -> None:
@@ -91,7 +62,7 @@ def read_lines(path: Path, expected: str, advice: str) -> Iterator[tuple[int, An
             f"{path}: line {number} is damaged (expected {expected}, found {shown(line[:60].decode(errors='replace'))})"
         )
         try:
-            yield number, unseal(parse_json(line, where), where, advice)
+            yield number, without_checksum(parse_json(line, where), where, advice)
         except DataError as error:
             raise DataError(f"{where}; {advice}") from error
 

@@ -59,16 +59,17 @@ def read_json(path: Path, advice: str = _RESTORE) -> Any:
     return parse_json(read_text(path), str(path), advice)
 
 
-def parse_json(text: str | bytes, where: str, advice: str = _RESTORE) -> Any:
-    """The values of JSON text. Raises :class:`DataError`."""
+def parse_json(text: str | bytes, where: str, advice: str = "") -> Any:
+    """The values of JSON text. Raises :class:`DataError` where it is none, saying ``advice``."""
+    advice = f"; {advice}" if advice else ""
     try:
         values = json.loads(text)
+        if _depth(values) > MAX_NESTING:
+            raise RecursionError
     except RecursionError as error:
-        raise DataError(f"{where}: is nested too deep; {advice}") from error
+        raise DataError(f"{where}: is nested too deep{advice}") from error
     except ValueError as error:  # also of text that is no UTF-8, and of integers of thousands of digits
-        raise DataError(f"{where}: not valid JSON ({first_line(error)}); {advice}") from error
-    if _depth(values) > MAX_NESTING:
-        raise DataError(f"{where}: is nested too deep; {advice}")
+        raise DataError(f"{where}: not valid JSON ({first_line(error)}){advice}") from error
     return values
 
 

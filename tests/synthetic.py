@@ -1,6 +1,8 @@
 """Small episodes made by hand: a ball rolls over a plate, and every point lies on one of the two."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flowlab.checksums import sha256_of
 from flowlab.cli import main
 from flowlab.geometry.camera import Camera
 from flowlab.provenance import Provenance
 from flowlab.records import Entity, Episode, PositionSource, Quality, Queries, Role, Tracks3D
 from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset, begin, summarize
-from flowlab.storage.manifest import Manifest
-from flowlab.storage.receipts import Receipt, keep_receipt
+from flowlab.storage.manifest import MANIFEST, Manifest
+from flowlab.storage.receipts import Receipt, keep_receipt, shard_path
 from flowlab.storage.shard import episode_digest, write_shard
 
 ENTITIES = (Entity("plate", "plate", Role.PROP), Entity("ball", "ball", Role.OBJECT))
@@ -123,10 +126,45 @@ def make_dataset(folder: Path, units: Iterable[Sequence[Episode]], **changes: An
         requested[unit[0].task] = requested.get(unit[0].task, 0) + len(unit)
     manifest = begin(folder, make_manifest(requested, **changes))
     for unit in units:
-        receipt = make_receipt(unit)
-        write_shard(folder / receipt.shard, unit, manifest.settings_digest)
-        keep_receipt(folder, receipt)
+        put_unit(folder, unit, manifest.settings_digest)
     return summarize(folder)
+
+
+def put_unit(folder: Path, episodes: Sequence[Episode], settings_digest: str, **changes: Any) -> Receipt:
+    """Write a unit's shard and its receipt."""
+    receipt = make_receipt(episodes, **changes)
+    path = folder / shard_path("shards", receipt.unit)
+    write_shard(path, episodes, settings_digest)
+    receipt = receipt.model_copy(update={"shard_sha256": sha256_of(path)})
+    keep_receipt(folder, receipt)
+    return receipt
+
+
+def unzipped(shard: Path) -> Path:
+    """The shard as the folder that it would have been before schema version 2, in place of the zip."""
+    folder = shard.with_suffix("")
+    with zipfile.ZipFile(shard) as archive:
+        archive.extractall(folder)
+    shard.unlink()
+    return folder
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the values of a JSON file, which has no checksum then, as if an earlier flowlab had written it."""
+    values = json.loads(path.read_text())
+    values.pop("sha256", None)
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+def as_folders(dataset: Path) -> Path:
+    """A dataset whose shards are folders, as before schema version 2: its files can be damaged one by one."""
+    for place, key in ("shards", "shard_sha256"), ("rejects", "rejects_sha256"):
+        for shard in (dataset / place).glob("*.zip"):
+            unzipped(shard)
+            edit_json(dataset / "receipts" / f"{shard.name.partition('.')[0]}.json", lambda r, k=key: r.update({k: ""}))
+    edit_json(dataset / MANIFEST, lambda m: m.update(schema_version=1))
+    return dataset
 
 
 def assert_same(a: Any, b: Any, where: str = "episode") -> None:

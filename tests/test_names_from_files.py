@@ -10,8 +10,8 @@ import yaml
 from synthetic import call_cli
 from trained_runs import SMALL, make_rolls, make_run
 
+from flowlab.checksums import with_checksum
 from flowlab.errors import DataError, UsageError
-from flowlab.json_lines import seal
 from flowlab.policies.checkpoint import read_trained
 from flowlab.registry import REGISTRIES, Registry, names_from_file
 
@@ -100,13 +100,13 @@ def test_a_strangers_run_imports_nothing(run: Path, installed: Path, tmp_path: P
     """Not for its policy, nor for its logs."""
     about, plan = (json.loads((run / name).read_text()) for name in ("policy.json", "run.json"))
     for values in (about, plan):
-        values.pop("digest")
+        values.pop("sha256")
     (tmp_path / "run").mkdir()
     plan["logs"] = [PLACES[0]]
     for policy in (PLACES[0], "dp3"):
         about["policy"]["settings"]["policy"] = policy
-        (tmp_path / "run/policy.json").write_text(json.dumps(seal(about)))
-        (tmp_path / "run/run.json").write_text(json.dumps(seal(plan, ("dataset",))))
+        (tmp_path / "run/policy.json").write_text(json.dumps(with_checksum(about)))
+        (tmp_path / "run/run.json").write_text(json.dumps(with_checksum(plan, ("dataset",))))
         for command in (
             ("train", tmp_path / "run", "--resume"),
             ("eval", tmp_path / "run"),
@@ -120,7 +120,7 @@ def test_a_strangers_run_imports_nothing(run: Path, installed: Path, tmp_path: P
             assert err.count("\n") == 1
     assert not [*installed.rglob("ran")]
     about["policy"]["settings"]["policy"] = "x" * 5000 + ":y"
-    (tmp_path / "run/policy.json").write_text(json.dumps(seal(about)))
+    (tmp_path / "run/policy.json").write_text(json.dumps(with_checksum(about)))
     with pytest.raises(DataError):
         read_trained(tmp_path / "run")
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.array_files import load_array, load_arrays, map_array
 from flowlab.config import PlainName, Settings
 from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.text import is_plain_name, printable, shown
 from flowlab.untrusted import parse_json, parse_yaml, read_bytes, read_json
-from tests.thoroughness import examples
 
 
 class TestText:

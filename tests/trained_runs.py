@@ -60,7 +60,7 @@ def make_run(*arguments: str | Path) -> Path:
 def lines_of(run: Path, kind: str | None = None) -> list[dict[str, Any]]:
     """Lines of ``metrics.jsonl`` without their digests, of one kind or of all."""
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert all(line.pop("digest") for line in lines)
+    assert all(line.pop("sha256") for line in lines)
     return [line for line in lines if kind in (None, line["kind"])]
 
 

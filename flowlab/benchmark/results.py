@@ -7,13 +7,13 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from flowlab.benchmark.migrations import migrate_result
+from flowlab.checksums import with_checksum, without_checksum
 from flowlab.config import explain
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import read_evaluations
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.files import remove_leftovers, told_when_unwritable, write_atomically
-from flowlab.json_lines import seal, unseal
 from flowlab.policies.checkpoint import read_trained
 from flowlab.untrusted import read_json
 
@@ -29,7 +29,7 @@ def unit_path(experiment: Path, name: str) -> Path:
 
 def write_result(path: Path, result: PolicyResult) -> None:
     """Write a result as JSON, in one step. Every episode is a line of its own."""
-    text = json.dumps(seal(result.model_dump(mode="json", exclude_defaults=True)))
+    text = json.dumps(with_checksum(result.model_dump(mode="json", exclude_defaults=True)))
     with told_when_unwritable(path, "make room, then give the same command again"):
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(path.parent)
@@ -42,7 +42,7 @@ def read_result(path: Path) -> PolicyResult:
     Raises:
         DataError: The file is damaged.
     """
-    values = unseal(read_json(path, _ADVICE), str(path), _ADVICE)
+    values = without_checksum(read_json(path, _ADVICE), str(path), _ADVICE)
     try:
         return PolicyResult.model_validate(migrate_result(values))
     except ValidationError as error:

@@ -101,9 +101,11 @@ def _reservation(folder: Path) -> str:
     """What checking cannot tell, to be added to what is sound."""
     if not (folder / "policy.json").exists():
         return ""
-    from flowlab.evaluation.validation import has_digests
+    from flowlab.evaluation.validation import has_checksums
 
-    return "" if has_digests(folder) else "; of an earlier version, without digests, so a changed number is not found"
+    return (
+        "" if has_checksums(folder) else "; of an earlier version, without checksums, so a changed number is not found"
+    )
 
 
 @click.command()

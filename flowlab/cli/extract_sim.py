@@ -22,6 +22,7 @@ from flowlab.cli.console import ProgressBar, print_json, show_extraction
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: observer.points=512.")
 @click.option("--renderer", type=click.Choice(["zbuffer", "gl"]), help="Short for --set expert.scene.renderer=...")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
+@click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, with an estimate; write nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def extract_sim(
@@ -35,6 +36,7 @@ def extract_sim(
     overrides: tuple[str, ...],
     renderer: str | None,
     shard: str,
+    repair: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -62,7 +64,7 @@ def extract_sim(
     with ProgressBar(quiet=as_json) as bar:
         dataset = extract(
             chosen, out, episodes=episodes, recipe=recipe, settings=changes, engine=engine, workers=workers,
-            shard=share, on_progress=lambda progress: show_extraction(bar, progress, "extracting"),
+            shard=share, repair=repair, on_progress=lambda progress: show_extraction(bar, progress, "extracting"),
         )  # fmt: skip
     from flowlab.cli.reports import finish_extraction
 

@@ -27,6 +27,7 @@ from flowlab.errors import DataError, UsageError
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
 @click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
+@click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what is recognized and how long it would take; write nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def track_real(
@@ -44,6 +45,7 @@ def track_real(
     workers: int | None,
     engine: str,
     shard: str,
+    repair: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -75,7 +77,7 @@ def track_real(
         dataset = label(
             paths, out, task=task, tracker=tracker, calibration=calibration, weights=weights, recipe=recipe,
             settings=changes, engine=engine, workers=workers, shard=share,
-            on_progress=lambda progress: show_extraction(bar, progress, "labeling", count_rejects=True),
+            repair=repair, on_progress=lambda progress: show_extraction(bar, progress, "labeling", count_rejects=True),
         )  # fmt: skip
     finish_extraction(dataset, time.monotonic() - start, share, as_json)
 

@@ -18,11 +18,11 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from flowlab.array_files import map_array
+from flowlab.checksums import with_checksum, without_checksum
 from flowlab.config import PlainName, Settings, explain
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, FlowlabError
 from flowlab.files import locked, remove_leftovers, temporary_path, write_json
-from flowlab.json_lines import seal, unseal
 from flowlab.records import Episode
 from flowlab.untrusted import read_json
 from flowlab.user_cache import user_cache
@@ -155,7 +155,7 @@ def _is_sound(folder: Path) -> bool:
 
 def _read_index(folder: Path) -> CacheIndex:
     path = folder / INDEX
-    values = unseal(read_json(path, "it can be deleted"), str(path), "it can be deleted")
+    values = without_checksum(read_json(path, "it can be deleted"), str(path), "it can be deleted")
     try:
         return CacheIndex.model_validate(values)
     except ValidationError as error:
@@ -204,6 +204,8 @@ class _Decoder:
         """The next episode."""
         start = self.episodes[-1].stop if self.episodes else 0
         stop = start + len(e)
+        if stop > self.source.frames:
+            raise DataError(f"{self.source.path}: holds more frames than its receipts say, {self.source.frames}")
         if self.episodes and (odd := sorted(self.arrays.keys() ^ per_frame.keys())):
             raise DataError(
                 f"{self.source.path}: {e.task} seed {e.seed}: '{odd[0]}' is in some episodes only; train on those that "
@@ -224,6 +226,8 @@ class _Decoder:
 
     def finish(self) -> None:
         """Write what is still to be written, the index last."""
+        if (found := self.episodes[-1].stop) != self.source.frames:
+            raise DataError(f"{self.source.path}: holds {found} frames, its receipts say {self.source.frames}")
         order = sorted(range(len(self.episodes)), key=lambda k: (self.episodes[k].task, self.episodes[k].seed))
         for name in self.whole[0]:
             np.save(self.folder / f"{name}.npy", np.stack([self.whole[k][name] for k in order]))
@@ -235,7 +239,7 @@ class _Decoder:
             episodes=tuple(self.episodes[k] for k in order),
             arrays={name: _checksum(self.folder / f"{name}.npy") for name in names},
         )
-        write_json(self.folder / INDEX, seal(index.model_dump(mode="json")))
+        write_json(self.folder / INDEX, with_checksum(index.model_dump(mode="json")))
 
 
 def _decode(source: TrainingSource, folder: Path, arrays_of: ArraysOf) -> None:

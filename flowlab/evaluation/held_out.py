@@ -130,4 +130,4 @@ def _cameras(path: Path, buffer: ReplayBuffer) -> tuple[Camera, ...]:
     """The camera of every demonstration: a simulated dataset's, or its recording's."""
     shards = {(r.task, r.seed): r.shard for r in Dataset(path).refs}
     attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
-    return tuple(Camera.from_json(attributes[shards[d.task, d.seed]]["camera"]) for d in buffer.episodes)
+    return tuple(Camera.from_json(attributes[shards[d.task, d.seed]].camera) for d in buffer.episodes)

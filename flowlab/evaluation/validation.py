@@ -5,11 +5,11 @@ from pathlib import Path
 
 import torch
 
+from flowlab.checksums import CHECKSUM
 from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
-from flowlab.json_lines import DIGEST
 from flowlab.policies.base import make_policy
 from flowlab.policies.checkpoint import (
     CHECKPOINTS,
@@ -28,9 +28,9 @@ from flowlab.untrusted import read_json
 from flowlab.viz.training_metrics import metrics_lines
 
 
-def has_digests(run: Path) -> bool:
-    """Whether a run's files tell their digests; those of earlier versions do not, so that damage may not be found."""
-    return DIGEST in read_json(run / POLICY)
+def has_checksums(run: Path) -> bool:
+    """Whether a run's files tell their checksums; those of earlier versions do not, so that damage may not be found."""
+    return CHECKSUM in read_json(run / POLICY)
 
 
 def validate_run(path: Path) -> Iterator[Finding]:

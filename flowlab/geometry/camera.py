@@ -1,5 +1,6 @@
 """The pinhole camera, in OpenCV's convention."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,7 +139,7 @@ class Camera(Record):
         }
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "Camera":
+    def from_json(cls, values: Mapping[str, Any]) -> "Camera":
         """The inverse of :meth:`to_json`.
 
         Args:

@@ -31,6 +31,7 @@ def extract(
     engine: str = "local",
     workers: int | None = None,
     shard: JobShard | str = JobShard(),
+    repair: bool = False,
     on_progress: Callable[[ExtractionProgress], None] | None = None,
 ) -> Dataset:
     """Make a dataset of simulated demonstrations with exact tracks, as ``flowlab extract-sim`` does.
@@ -44,6 +45,7 @@ def extract(
         engine: Where it is done: the name of an engine.
         workers: Processes; None for one for each core.
         shard: The part to do, for jobs that fill one dataset together: ``0/4``.
+        repair: Read all that is there, and make again what is damaged.
         on_progress: Called whenever an episode is there.
 
     Returns:
@@ -64,6 +66,7 @@ def extract(
         start_engine=engine_for(chosen, engine, workers),
         share=JobShard.parse(shard) if isinstance(shard, str) else shard,
         report=on_progress or (lambda _: None),
+        repair=repair,
     )
 
 

@@ -1,6 +1,7 @@
 """Fill a dataset by a recipe: run planned units on an engine, and keep the books."""
 
 import errno
+import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,7 +17,9 @@ from flowlab.pipeline.worker import run_unit
 from flowlab.storage.dataset import Dataset, begin, summarize
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt, read_receipts
+from flowlab.storage.repair import forget_damaged
 
+_LOG = logging.getLogger(__name__)
 _SECONDS_BETWEEN_SUMMARIES = 5.0
 
 
@@ -35,8 +38,12 @@ def fill(
     start_engine: StartEngine[WorkUnit, Receipt],
     share: JobShard,
     report: Callable[[ExtractionProgress], None],
+    repair: bool = False,
 ) -> Dataset:
     """Run a plan, made for the manifest as it is on disk, until there is nothing left of it, and keep the books.
+
+    Units whose receipt is damaged or whose shard is gone are made again; with ``repair`` every shard is read, and those
+    that are damaged are made again, too.
 
     Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
     the dataset is whole in either case.
@@ -44,6 +51,8 @@ def fill(
     log = folder / "failures.log"
     try:
         manifest = begin(folder, manifest)
+        for problem in forget_damaged(folder, thorough=repair):
+            _LOG.warning("flowlab: %s; the unit is to be made again", problem)
         log.unlink(missing_ok=True)
     except MissingFileError:
         raise

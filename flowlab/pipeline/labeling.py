@@ -20,6 +20,7 @@ from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
+from flowlab.text import is_plain_name, shown
 
 
 def label(
@@ -35,6 +36,7 @@ def label(
     engine: str = "local",
     workers: int | None = None,
     shard: JobShard | str = JobShard(),
+    repair: bool = False,
     on_progress: Callable[[ExtractionProgress], None] | None = None,
 ) -> Dataset:
     """Make a dataset of RGB-D recordings with estimated tracks, as ``flowlab track-real`` does.
@@ -51,6 +53,7 @@ def label(
         engine: Where it is done: the name of an engine.
         workers: Processes; None for one for each core.
         shard: The part to do, for jobs that fill one dataset together: ``0/4``.
+        repair: Read all that is there, and make again what is damaged.
         on_progress: Called whenever a recording is done.
 
     Returns:
@@ -69,6 +72,7 @@ def label(
         start_engine=engine_for(chosen, engine, workers),
         share=JobShard.parse(shard) if isinstance(shard, str) else shard,
         report=on_progress or (lambda _: None),
+        repair=repair,
     )
 
 
@@ -97,8 +101,8 @@ def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) ->
     for path in find_recordings(paths, settings.reader):
         place = Path(os.path.abspath(path))
         name = task or _task_said(place, settings) or place.parent.name
-        if not name or "/" in name or name.startswith("."):
-            raise UsageError(f"{path}: '{name}' cannot be the name of a task; give one with --task")
+        if not is_plain_name(name):
+            raise UsageError(f"{path}: {shown(name)} cannot be the name of a task; give one with --task")
         found.append(Recorded(task=name, name=place.name, source=str(place)))
     return number_recordings((), found)
 
@@ -125,6 +129,7 @@ def label_recordings(
     start_engine: StartEngine[WorkUnit, Receipt],
     share: JobShard = JobShard(),
     report: Callable[[ExtractionProgress], None] = lambda _: None,
+    repair: bool = False,
 ) -> Dataset:
     """Label recordings into ``folder``; what an earlier run did is kept, but what it could not open is tried again.
 
@@ -145,7 +150,9 @@ def label_recordings(
         _forget_unopened(folder, {r.seed for r in mine if r.seed % share.count == share.index})
         return RecordingScheduler(mine)
 
-    return fill(recipe, manifest, plan_for, folder, start_engine=start_engine, share=share, report=report)
+    return fill(
+        recipe, manifest, plan_for, folder, start_engine=start_engine, share=share, report=report, repair=repair
+    )
 
 
 def _forget_unopened(folder: Path, seeds: set[int]) -> None:

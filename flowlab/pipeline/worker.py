@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from functools import lru_cache
 from pathlib import Path
 
+from flowlab.checksums import sha256_of
 from flowlab.errors import DataError
 from flowlab.files import locked
 from flowlab.pipeline.recipe import parse_recipe
@@ -14,7 +15,7 @@ from flowlab.pipeline.stage import Pipeline, Rejected
 from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode
 from flowlab.storage import stats
-from flowlab.storage.receipts import Receipt, Reject, Widths, keep_receipt, known_widths
+from flowlab.storage.receipts import Receipt, Reject, Widths, keep_receipt, known_widths, shard_path
 from flowlab.storage.shard import episode_digest
 
 
@@ -49,8 +50,10 @@ def run_unit(
     known = known_widths(folder)
     with nullcontext() if known else locked(folder):  # the first episodes decide, and only one unit has them
         episodes, misfits = _fitting(episodes, known or known_widths(folder), unit)
-        for place, found in ("shards", episodes), ("rejects", kept):
-            _store(pipeline, folder / place / f"{unit.name}.zarr", found, settings_digest)
+        checksums = {
+            place: _store(pipeline, folder, place, unit.name, found, settings_digest)
+            for place, found in (("shards", episodes), ("rejects", kept))
+        }
         receipt = Receipt(
             unit=unit.name,
             task=unit.task,
@@ -58,6 +61,8 @@ def run_unit(
             accepted=tuple(e.seed for e in episodes),
             frames=tuple(len(e) for e in episodes),
             digests=tuple(episode_digest(e) for e in episodes),
+            shard_sha256=checksums["shards"],
+            rejects_sha256=checksums["rejects"],
             rejects=(*rejects, *misfits),
             stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
             stats=stats.summarize(episodes) if episodes else {},
@@ -92,12 +97,18 @@ def _fitting(episodes: Sequence[Episode], known: Widths | None, unit: WorkUnit) 
     return fitting, misfits
 
 
-def _store(pipeline: Pipeline, path: Path, episodes: list[Episode], settings_digest: str) -> None:
-    """Write a shard; where there is nothing to write, remove what an earlier try at the unit has left."""
-    if episodes:
-        pipeline.store(path, episodes, settings_digest)
-    else:
-        shutil.rmtree(path, ignore_errors=True)
+def _store(
+    pipeline: Pipeline, folder: Path, place: str, unit: str, episodes: list[Episode], settings_digest: str
+) -> str:
+    """Write a shard, and its SHA-256; where there is nothing to write, remove what an earlier try has left."""
+    path, folder_shard = (folder / shard_path(place, unit, zipped=zipped) for zipped in (True, False))
+    if folder_shard.is_dir() and not folder_shard.is_symlink():
+        shutil.rmtree(folder_shard, ignore_errors=True)
+    if not episodes:
+        path.unlink(missing_ok=True)
+        return ""
+    pipeline.store(path, episodes, settings_digest)
+    return sha256_of(path)
 
 
 @lru_cache(maxsize=1)

@@ -16,12 +16,12 @@ from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from flowlab.checksums import json_checksum, with_checksum, without_checksum
 from flowlab.config import Settings, explain
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.files import check_inside, new_file, remove_leftovers, write_json
-from flowlab.json_lines import DIGEST, json_digest, seal, unseal
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
 from flowlab.registry import names_from_file
@@ -260,8 +260,8 @@ def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig, groups: G
         )
     if any((folder / CHECKPOINTS).glob("step-*")):
         raise UsageError(f"{folder}: holds checkpoints, but no {POLICY} that says of what; choose another --out")
-    about = seal(json.loads(trained.model_dump_json()))
-    plan = seal(json.loads(run.model_dump_json()), _FREE)
+    about = with_checksum(json.loads(trained.model_dump_json()))
+    plan = with_checksum(json.loads(run.model_dump_json()), _FREE)
     with writing_run(folder, "nothing was begun. Make room, then give the same command again, or choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
@@ -278,7 +278,7 @@ def _write_resume(folder: Path, step: int, groups: Groups, policy: str, run: str
 
 def _write(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    told = json.dumps(seal({**about, "tensors": _digest(plain)}))
+    told = json.dumps(with_checksum({**about, "tensors": _digest(plain)}))
     with new_file(path) as temporary:
         save_file(plain, temporary, {_ABOUT: told})  # under one key: several would come in any order
 
@@ -295,7 +295,7 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
 
 def _identity(values: Mapping[str, Any]) -> str:
     """Identifies what ``policy.json`` or ``run.json`` says, wherever the dataset is, for the weights beside it."""
-    return json_digest({k: v for k, v in values.items() if k not in (*_FREE, DIGEST)})
+    return json_checksum(values, _FREE)
 
 
 def _identity_in(path: Path) -> str:
@@ -310,7 +310,7 @@ def _read(path: Path, run: Path, advice: str) -> tuple[dict[str, Tensor], int]:
             about = _metadata(file, str(path), advice)
         tensors, step = load_file(path), int(about["step"])
     if "tensors" in about and _digest(tensors) != about["tensors"]:
-        raise DataError(f"{path}: damaged (its digest is another than its content's); {advice}")
+        raise DataError(f"{path}: damaged (its content does not match its checksum); {advice}")
     for name, other in (("policy", run / POLICY), ("run", run / RUN)):
         if name in about and about[name] != _identity_in(other):
             raise DataError(f"{path}: was saved beside another {other.name} than {other}; restore both from one run")
@@ -322,7 +322,7 @@ def _metadata(file: Any, where: str, advice: str) -> dict[str, Any]:
     did not say it: a name that changed on disk must not pass for one that is left out."""
     told: dict[str, str] = file.metadata() or {}
     if told.keys() == {_ABOUT}:
-        return dict(unseal(parse_json(told[_ABOUT], where, advice), where, advice))
+        return dict(without_checksum(parse_json(told[_ABOUT], where, advice), where, advice))
     return {"step": told["step"]}
 
 
@@ -346,7 +346,7 @@ def _validated(model: type[Model], path: Path, free: tuple[str, ...] = ()) -> Mo
     found = values.get("format", 1) if isinstance(values, dict) and model is TrainedPolicy else FORMAT
     if found not in (1, FORMAT):
         raise DataError(f"{path}: format is {shown(found)}, this flowlab reads {FORMAT}; use the flowlab that wrote it")
-    values = unseal(values, str(path), _RESTORE, free)
+    values = without_checksum(values, str(path), _RESTORE, free)
     values = migrate_policy(values) if model is TrainedPolicy else values
     try:
         with names_from_file():

@@ -17,6 +17,8 @@ OFF_SURFACE = 0.03
 """A visible point this much farther from the cloud [m] than the cloud is coarse lies on no surface."""
 OFF_SURFACE_SHARE = 0.02
 """Share of an episode's visible points that may do so: pixels at silhouettes show what is behind."""
+LOOKED_AT = 8
+"""Every so many frames it is looked whether points lie on the surface: labels that do not fit do not for one frame."""
 FASTEST = 3.0
 """An estimated point that is faster than this [m/s], and jumps farther than its stated errors explain, is wrong."""
 JUMPING_SHARE = 0.01
@@ -151,17 +153,21 @@ def _off_surface(e: Episode) -> Iterator[ArrayProblem]:
     quality = e.tracks.quality
     known = e.tracks.visible if quality is None else e.tracks.visible & (quality.source != PositionSource.FILLED)
     slack = np.zeros(known.shape, np.float32) if quality is None else 2 * quality.sigma
-    for t in range(0, len(e), 4):
+    for t in range(0, len(e), LOOKED_AT):
         cloud = e.point_cloud[t, : e.point_count[t]]
         xyz = e.tracks.xyz_world[t]
-        inside = known[t] & ((xyz > cloud.min(0)) & (xyz < cloud.max(0))).all(1)
-        seen = xyz[inside]
-        if len(cloud) < 2 or len(seen) == 0:
+        if len(cloud) < 2 or not known[t].any():
             continue
-        tree = cKDTree(cloud)
-        spacing = np.asarray(tree.query(cloud, k=2)[0])[:, 1].min()
+        tree = cKDTree(cloud, compact_nodes=False, balanced_tree=False)
+        inside = known[t] & ((xyz > tree.mins) & (xyz < tree.maxes)).all(1)
+        seen = xyz[inside]
+        if len(seen) == 0:
+            continue
+        total += len(seen)
         distance = np.asarray(tree.query(seen)[0]) - e.tracks.association_distance.max() - slack[t, inside]
-        far, total = far + int((distance > spacing + OFF_SURFACE).sum()), total + len(seen)
+        if distance.max() > OFF_SURFACE:  # else there is no need to know how coarse the cloud is
+            spacing = np.asarray(tree.query(cloud, k=2)[0])[:, 1].min()
+            far += int((distance > spacing + OFF_SURFACE).sum())
     if far > (OFF_SURFACE_SHARE if quality is None else OFF_SURFACE_SHARE_ESTIMATED) * total:
         yield ArrayProblem(
             "data/tracks", f"{far} of {total} visible points lie off the surface; the labels do not fit the cloud"

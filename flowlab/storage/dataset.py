@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.errors import DataError, MissingFileError
-from flowlab.files import locked, remove_leftovers, write_atomically, write_json
+from flowlab.files import locked, remove_leftovers, write_atomically
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
-from flowlab.storage.episodes import EpisodeRef, EpisodeSequence
+from flowlab.storage.episodes import EpisodeRef, EpisodeSequence, checked, unit_refs, unit_shard
 from flowlab.storage.manifest import MANIFEST, Manifest, differences
 from flowlab.storage.receipts import check_widths, read_receipts
 from flowlab.storage.recorded import number_recordings
+from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.storage.shard import Shard
 
 
@@ -72,14 +73,7 @@ class Dataset(EpisodeSequence):
     @cached_property
     def refs(self) -> list[EpisodeRef]:
         """All episodes that count: those with a receipt."""
-        return sorted(
-            (
-                EpisodeRef(r.task, seed, frames, r.shard, k)
-                for r in self.receipts
-                for k, (seed, frames) in enumerate(zip(r.accepted, r.frames, strict=True))
-            ),
-            key=lambda ref: (ref.task, ref.seed),
-        )
+        return sorted((ref for r in self.receipts for ref in unit_refs(r)), key=lambda ref: (ref.task, ref.seed))
 
     @property
     def provenance(self) -> Provenance:
@@ -110,7 +104,9 @@ class Dataset(EpisodeSequence):
         """
         for receipt in self.receipts:
             if receipt.accepted:
-                yield from Shard(self.path / receipt.shard).episodes()
+                refs = unit_refs(receipt)
+                for ref, episode in zip(refs, unit_shard(self.path, receipt).episodes(), strict=True):
+                    yield checked(self.path, ref, episode)
 
     @cached_property
     def rejects(self) -> list[RejectRef]:
@@ -157,7 +153,7 @@ class Dataset(EpisodeSequence):
             DataError: Some episodes have wider states or actions than others.
         """
         check_widths(self.path, self.receipts)
-        return stats.describe(stats.merge(dict(r.stats) for r in self.receipts if r.accepted))
+        return stats.describe(stats.merge(r.stats for r in self.receipts if r.accepted))
 
     @property
     def fingerprint(self) -> str:
@@ -188,6 +184,9 @@ def begin(folder: Path, manifest: Manifest) -> Manifest:
     Returns the manifest now on disk, which asks for the episodes of both. Raises :class:`DataError` with
     the differing settings.
     """
+    places = [folder / name for name in ("shards", "receipts", "rejects")]
+    if linked := [p for p in places if p.is_symlink()]:
+        raise DataError(f"{linked[0]}: is a link, and nothing is written through one; put the folder itself there")
     try:
         (folder / "shards").mkdir(parents=True, exist_ok=True)
         (folder / "receipts").mkdir(exist_ok=True)
@@ -195,8 +194,8 @@ def begin(folder: Path, manifest: Manifest) -> Manifest:
         raise DataError(f"{folder}: cannot make a dataset here ({error.strerror}); choose another --out") from error
     with locked(folder):
         manifest = _joined(folder, manifest)
-        write_json(folder / MANIFEST, json.loads(manifest.model_dump_json()))
-    for place in (folder, folder / "shards", folder / "receipts", folder / "rejects"):
+        manifest.write(folder)
+    for place in (folder, *places):
         remove_leftovers(place)
     return manifest
 
@@ -209,7 +208,9 @@ def _joined(folder: Path, manifest: Manifest) -> Manifest:
         _check_settings(folder, old, manifest)
         known = old.recordings
         requested = {t: max(n, manifest.requested.get(t, 0)) for t, n in old.requested.items()}
-        joined = old.model_copy(update={"requested": {**manifest.requested, **requested}})
+        joined = old.model_copy(
+            update={"requested": {**manifest.requested, **requested}, "schema_version": SCHEMA_VERSION}
+        )
     if manifest.recordings:
         recordings = number_recordings(known, manifest.recordings)
         requested = dict(Counter(r.task for r in recordings))
@@ -236,8 +237,16 @@ def _check_settings(folder: Path, old: Manifest, manifest: Manifest) -> None:
 def summarize(folder: Path) -> Dataset:
     """Write what follows from the receipts: statistics, rejects and the dataset card."""
     dataset = Dataset(folder)
-    write_json(folder / "stats.json", dataset.stats)
-    rejects = [x.model_dump_json(exclude_defaults=True) + "\n" for r in dataset.receipts for x in r.rejects]
-    write_atomically(folder / "rejects.jsonl", "".join(rejects))
-    write_atomically(folder / "README.md", dataset_card(dataset.manifest, dataset.receipts, dataset.stats))
+    for name, text in summaries(dataset).items():
+        write_atomically(folder / name, text)
     return dataset
+
+
+def summaries(dataset: Dataset) -> dict[str, str]:
+    """The files of a dataset that follow from its receipts, by name."""
+    rejects = [x.model_dump_json(exclude_defaults=True) + "\n" for r in dataset.receipts for x in r.rejects]
+    return {
+        "stats.json": json.dumps(dataset.stats, indent=1) + "\n",
+        "rejects.jsonl": "".join(rejects),
+        "README.md": dataset_card(dataset.manifest, dataset.receipts, dataset.stats),
+    }

@@ -10,7 +10,8 @@ from typing import Any, overload
 
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
-from flowlab.storage.shard import Shard
+from flowlab.storage.receipts import Receipt
+from flowlab.storage.shard import REPAIR, Shard, episode_digest
 
 _TASKS_SHOWN = 6
 
@@ -26,6 +27,33 @@ class EpisodeRef:
     """Path below the dataset."""
     position: int
     """Index within the shard."""
+    digest: str
+    """SHA-256 of its content, see :func:`~flowlab.storage.shard.episode_digest`."""
+
+
+def unit_refs(receipt: Receipt) -> list[EpisodeRef]:
+    """Where the episodes of a unit lie, in the order of its shard."""
+    told = zip(receipt.accepted, receipt.frames, receipt.digests, strict=True)
+    return [EpisodeRef(receipt.task, s, n, receipt.shard, k, digest) for k, (s, n, digest) in enumerate(told)]
+
+
+def unit_shard(folder: Path, receipt: Receipt) -> Shard:
+    """The shard of a unit. Raises :class:`DataError` where it holds more or fewer episodes than its receipt says."""
+    shard = Shard(folder / receipt.shard)
+    if len(shard) != len(receipt.accepted):
+        raise DataError(
+            f"{shard.path}: holds {len(shard)} episodes, its receipt says {len(receipt.accepted)}; {REPAIR}"
+        )
+    return shard
+
+
+def checked(folder: Path, ref: EpisodeRef, episode: Episode) -> Episode:
+    """An episode that was read. Raises :class:`DataError` where it is not what its receipt says."""
+    if episode_digest(episode) != ref.digest:
+        raise DataError(
+            f"{folder / ref.shard}: {ref.task} seed {ref.seed}: content differs from what its receipt says; {REPAIR}"
+        )
+    return episode
 
 
 class EpisodeSequence(Sequence[Episode], ABC):
@@ -62,7 +90,7 @@ class EpisodeSequence(Sequence[Episode], ABC):
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path}: no episode {index}; there are {len(self)}, counted from 0")
         ref = self.refs[index]
-        return Shard(self.path / ref.shard).episode(ref.position)
+        return checked(self.path, ref, Shard(self.path / ref.shard).episode(ref.position))
 
     def __iter__(self) -> Iterator[Episode]:
         """Every episode, in order."""
@@ -70,7 +98,7 @@ class EpisodeSequence(Sequence[Episode], ABC):
         for ref in self.refs:
             if shard is None or ref.shard != name:
                 name, shard = ref.shard, Shard(self.path / ref.shard)
-            yield shard.episode(ref.position)
+            yield checked(self.path, ref, shard.episode(ref.position))
 
     def __contains__(self, episode: object) -> bool:
         """Whether an episode of the same task and seed is here. Raises :class:`UsageError` for what is no episode."""

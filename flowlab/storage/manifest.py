@@ -8,16 +8,20 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from flowlab.config import Settings
+from flowlab.checksums import with_checksum, without_checksum
+from flowlab.config import PlainName, Settings, explain
 from flowlab.errors import DataError
+from flowlab.files import write_json
 from flowlab.provenance import Provenance
 from flowlab.storage.migrations import migrate_manifest
 from flowlab.storage.recorded import Recorded
-from flowlab.storage.schema import SCHEMA_VERSION
+from flowlab.storage.schema import READABLE_VERSIONS, SCHEMA_VERSION
+from flowlab.text import shown
 from flowlab.untrusted import read_json
 from flowlab.version import __version__
 
 MANIFEST = "flowlab.json"
+_RESTORE = "restore it from a copy, or make the dataset anew in another folder"
 UNITS = {
     "length": "m",
     "time": "s",
@@ -37,7 +41,7 @@ class Manifest(Settings):
     """Every setting of every stage, by stage name."""
     units: Mapping[str, str] = UNITS
     first_seed: int
-    requested: Mapping[str, int]
+    requested: Mapping[PlainName, int]
     """Episodes asked for, by task."""
     provenance: Provenance
     """Where the episodes come from, and what their numbers mean."""
@@ -60,19 +64,21 @@ class Manifest(Settings):
         path = folder / MANIFEST
         if not path.exists():
             raise DataError(f"{folder}: not a flowlab dataset (it has no {MANIFEST})")
-        values = read_json(path)
+        values = without_checksum(read_json(path, _RESTORE), path, _RESTORE)
         found = values.get("schema_version") if isinstance(values, dict) else None
-        if found != SCHEMA_VERSION:
+        if found not in READABLE_VERSIONS:
             raise DataError(
-                f"{path}: schema_version is {found}, this flowlab reads {SCHEMA_VERSION}; "
-                "use the flowlab version that wrote it"
+                f"{path}: schema_version is {shown(found)}, this flowlab reads "
+                f"{' and '.join(map(str, READABLE_VERSIONS))}; use the flowlab version that wrote it"
             )
         try:
             return cls.model_validate(migrate_manifest(values))
         except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(map(str, first["loc"]))
-            raise DataError(f"{path}: field '{field}': {first['msg']}") from error
+            raise DataError(f"{path}: {explain(error, cls)}; {_RESTORE}") from error
+
+    def write(self, folder: Path) -> None:
+        """Make it that of a dataset folder. Raises :class:`OSError`."""
+        write_json(folder / MANIFEST, with_checksum(json.loads(self.model_dump_json())))
 
 
 def differences(

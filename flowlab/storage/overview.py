@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.receipts import StageTally
-from flowlab.storage.shard import Shard, StoredArray
+from flowlab.storage.shard import Shard
+from flowlab.storage.shard_arrays import StoredArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,16 +4,21 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from pydantic import ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from flowlab.config import Settings
+from flowlab.checksums import with_checksum, without_checksum
+from flowlab.config import PlainName, Settings, explain
 from flowlab.errors import DataError
 from flowlab.files import write_json
 from flowlab.storage.migrations import migrate_receipt
+from flowlab.storage.shard_files import SUFFIX
+from flowlab.storage.stats import MergeableStats, stats_problem
+from flowlab.text import shown
 from flowlab.untrusted import read_json
 from flowlab.version import __version__
+
+ANEW = "the same extract or track command makes this unit anew"
 
 
 class Reject(Settings):
@@ -70,8 +75,8 @@ class Widths:
 class Receipt(Settings):
     """What became of one work unit; a shard without a receipt does not count."""
 
-    unit: str
-    task: str
+    unit: PlainName
+    task: PlainName
     seeds: tuple[int, ...]
     """All seeds tried."""
     accepted: tuple[int, ...]
@@ -81,29 +86,28 @@ class Receipt(Settings):
     rejects: tuple[Reject, ...] = ()
     digests: tuple[str, ...]
     """SHA-256 of each of these episodes."""
+    shard_sha256: str = ""
+    """Of the shard's file; empty where there is none, or where it is a folder, as before schema version 2."""
+    rejects_sha256: str = ""
+    """Of the file that keeps rejected episodes; empty as above."""
     stages: Mapping[str, StageTally] = {}
-    stats: Mapping[str, Any] = {}
-    """Mergeable statistics, see :mod:`flowlab.storage.stats`."""
+    stats: MergeableStats = Field(default_factory=MergeableStats)
+    """Mergeable statistics of the episodes."""
     peak_memory_mb: float = 0.0
     flowlab: str = __version__
-
-    @model_validator(mode="after")
-    def _plain_names(self) -> "Receipt":
-        for name in (self.unit, self.task):
-            if not name or name.startswith(".") or "/" in name or "\0" in name:
-                raise ValueError(f"'{name}' is no plain name; unit and task name files of this dataset")
-        return self
 
     @model_validator(mode="after")
     def _lists_match(self) -> "Receipt":
         if not len(self.accepted) == len(self.frames) == len(self.digests):
             raise ValueError("accepted, frames and digests must be equally long")
+        if self.accepted and (problem := stats_problem(self.stats)):
+            raise ValueError(f"stats: {problem}")
         return self
 
     @property
     def shard(self) -> str:
         """Path of the shard below the dataset."""
-        return f"shards/{self.unit}.zarr"
+        return shard_path("shards", self.unit, zipped=bool(self.shard_sha256))
 
     @property
     def widths(self) -> "Widths | None":
@@ -116,7 +120,12 @@ class Receipt(Settings):
     @property
     def rejects_shard(self) -> str:
         """Path below the dataset of the shard that keeps rejected episodes, where there are any to keep."""
-        return f"rejects/{self.unit}.zarr"
+        return shard_path("rejects", self.unit, zipped=bool(self.rejects_sha256))
+
+
+def shard_path(place: str, unit: str, *, zipped: bool = True) -> str:
+    """Path below a dataset of a unit's shard, in ``shards`` or ``rejects``."""
+    return f"{place}/{unit}{SUFFIX if zipped else '.zarr'}"
 
 
 def read_receipts(folder: Path) -> list[Receipt]:
@@ -146,20 +155,29 @@ def check_widths(folder: Path, receipts: Iterable[Receipt]) -> None:
 
 def _receipts(folder: Path) -> Iterator[Receipt]:
     """All receipts of a dataset, as they are found."""
-    for path in (folder / "receipts").glob("*.json"):
-        if path.name.startswith("."):
-            continue
-        try:
-            receipt = Receipt.model_validate(migrate_receipt(read_json(path)))
-        except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(map(str, first["loc"])) or "lists"
-            raise DataError(f"{path}: field '{field}': {first['msg']}") from error
-        if receipt.unit != path.stem:
-            raise DataError(f"{path}: field 'unit': is '{receipt.unit}', expected '{path.stem}' as the file is called")
-        yield receipt
+    yield from map(read_receipt, receipt_files(folder))
+
+
+def receipt_files(folder: Path) -> list[Path]:
+    """The files of all receipts."""
+    return sorted(p for p in (folder / "receipts").glob("*.json") if not p.name.startswith("."))
+
+
+def read_receipt(path: Path) -> Receipt:
+    """A receipt. Raises :class:`DataError` where it is damaged."""
+    values = without_checksum(read_json(path, ANEW), path, ANEW)
+    try:
+        receipt = Receipt.model_validate(migrate_receipt(values))
+    except ValidationError as error:
+        raise DataError(f"{path}: {explain(error, Receipt)}; {ANEW}") from error
+    if receipt.unit != path.stem:
+        raise DataError(
+            f"{path}: unit: is {shown(receipt.unit)}, expected {shown(path.stem)} as the file is called; {ANEW}"
+        )
+    return receipt
 
 
 def keep_receipt(folder: Path, receipt: Receipt) -> None:
     """Write a unit's receipt: from now on its shard counts."""
-    write_json(folder / "receipts" / f"{receipt.unit}.json", json.loads(receipt.model_dump_json()))
+    values = with_checksum(json.loads(receipt.model_dump_json()))
+    write_json(folder / "receipts" / f"{receipt.unit}.json", values)

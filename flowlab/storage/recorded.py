@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from flowlab.config import Settings
+from flowlab.config import PlainName, Settings
 from flowlab.errors import DataError, UsageError
 from flowlab.text import natural_key
 
@@ -11,8 +11,8 @@ from flowlab.text import natural_key
 class Recorded(Settings):
     """One recording of a dataset."""
 
-    task: str
-    name: str
+    task: PlainName
+    name: PlainName
     """Of its folder or file; with the task, what it is known by."""
     seed: int = -1
     """Its number in the dataset; -1 until it has one."""

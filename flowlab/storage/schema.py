@@ -7,7 +7,9 @@ import numpy as np
 
 from flowlab.records import Episode, Quality
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Since 2 a shard is one file; until then it was a folder."""
+READABLE_VERSIONS = (1, SCHEMA_VERSION)
 
 
 @dataclass(frozen=True, slots=True)

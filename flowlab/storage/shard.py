@@ -1,27 +1,28 @@
-"""One shard: a zarr v3 group of whole episodes, there under its name only when complete."""
+"""One shard: whole episodes as a zarr v3 group in a stored zip, there under its name only when complete."""
 
-import errno
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import EllipsisType
 from typing import Any
 
 import numpy as np
 import zarr
+from pydantic import ValidationError
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
+from flowlab.config import Settings, explain
 from flowlab.errors import DataError, RecordError, first_line
-from flowlab.files import temporary_path
+from flowlab.files import new_file
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
 from flowlab.storage.schema import EPISODE_ENDS, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
+from flowlab.storage.shard_arrays import StoredArray, stored_array
+from flowlab.storage.shard_files import open_files, write_zip
+from flowlab.text import shown
+from flowlab.untrusted import parse_json
 
 STEPS_PER_CHUNK = 256
 """A chunk holds at most this many rows; most episodes are one chunk per array."""
@@ -30,39 +31,16 @@ STEPS_PER_CHUNK = 256
 def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
     """Write episodes to ``path``, replacing what a run that left no receipt may have put there.
 
-    The shard is made in memory, written to a temporary folder beside its place, and renamed: whatever
-    ends the process, ``path`` is either absent or whole. Chunks carry a CRC-32C checksum.
+    Whatever ends the process, ``path`` is either absent or whole. Chunks carry a CRC-32C checksum, files a CRC-32.
+
+    Raises:
+        DataError: The episodes do not share their camera, their entities or which arrays they have.
+        OSError: It cannot be written.
     """
     files = _encode(episodes, settings_digest)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_path(path)
-    try:
-        for name, content in files.items():
-            file = temporary / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(content)
-        _replace(path, temporary)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _replace(path: Path, whole: Path) -> None:
-    """Put a folder in the place of another, which is moved away first: deleting takes time, and may be cut short.
-
-    Another job may do the same at the same moment, with the same content.
-    """
-    while True:
-        old = whole.with_name(f"{whole.name}-old")
-        with suppress(FileNotFoundError):
-            os.rename(path, old)
-        try:
-            os.rename(whole, path)
-            return
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
-        finally:
-            shutil.rmtree(old, ignore_errors=True)
+    with new_file(path) as temporary:
+        write_zip(temporary, files)
 
 
 def episode_digest(episode: Episode) -> str:
@@ -77,16 +55,20 @@ def episode_digest(episode: Episode) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True, slots=True)
-class StoredArray:
-    """What an array of a shard is, without its values."""
+class _EpisodeAttributes(Settings):
+    task: str
+    extras: Mapping[str, Any] = {}
 
-    path: str
-    """Below the shard: ``data/tracks``."""
-    dims: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: str
-    unit: str
+
+class ShardAttributes(Settings):
+    """What a shard says of its episodes beside their arrays."""
+
+    flowlab_schema: int
+    settings_digest: str
+    camera: Mapping[str, Any]
+    entities: tuple[tuple[str, str, str], ...]
+    """Geom, body and role of each."""
+    episodes: tuple[_EpisodeAttributes, ...]
 
 
 class Shard:
@@ -95,79 +77,60 @@ class Shard:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self.group = zarr.open_group(path, mode="r", zarr_format=3)
-        except (FileNotFoundError, ValueError, KeyError) as error:
-            raise DataError(f"{path}: not a readable zarr v3 group ({first_line(error)}); {_REDO}") from error
-        self.attributes: Mapping[str, Any] = self.group.attrs.asdict()
-        lacking = {"episodes", "camera", "entities", "settings_digest"} - self.attributes.keys()
-        if lacking:
-            raise DataError(f"{path}: not a shard of flowlab (it lacks {', '.join(sorted(lacking))}); {_REDO}")
+            self._files = open_files(path)
+            group = parse_json(self._files.read("zarr.json"), f"{path}/zarr.json")
+        except DataError as error:
+            raise DataError(f"{error}; {REPAIR}") from error
+        about = group.get("attributes") if isinstance(group, dict) else None
+        try:
+            self.attributes = ShardAttributes.model_validate(about)
+        except ValidationError as error:
+            raise DataError(f"{path}: not a shard of flowlab ({explain(error, ShardAttributes)}); {REPAIR}") from error
 
     def __len__(self) -> int:
-        return len(self.attributes["episodes"])
+        return len(self.attributes.episodes)
 
     def about(self, k: int) -> Mapping[str, Any]:
         """The ``extras`` of the k-th episode."""
-        extras: Mapping[str, Any] = self.attributes["episodes"][k]["extras"]
-        return extras
+        return self.attributes.episodes[k].extras
 
     def array(self, spec_path: str, rows: slice | int | EllipsisType = ...) -> np.ndarray:
         """An array, or some rows of it; a missing or damaged chunk is an error, never silent zeros."""
-        place = f"{self.path}/{spec_path}"
-        array = self._open(spec_path)
-        missing = array.nchunks - array.nchunks_initialized
-        if missing:
-            raise DataError(f"{place}: {missing} of {array.nchunks} chunks missing; {_REDO}")
         try:
-            return np.asarray(array[rows])
-        except (ValueError, RuntimeError, OSError) as error:
-            raise DataError(f"{place}: damaged ({first_line(error)}); {_REDO}") from error
-
-    def _open(self, spec_path: str) -> "zarr.Array[Any]":
-        """An array, its values unread."""
-        place = f"{self.path}/{spec_path}"
-        try:
-            array = self.group[spec_path]
-        except KeyError as error:
-            raise DataError(f"{place}: the array is missing; {_REDO}") from error
-        except (ValueError, TypeError, OSError) as error:
-            raise DataError(f"{place}: damaged ({first_line(error)}); {_REDO}") from error
-        if not isinstance(array, zarr.Array):
-            raise DataError(f"{place}: damaged (it is no array); {_REDO}")
-        return array
+            return stored_array(self._files, spec_path).read(self._files, rows)
+        except DataError as error:
+            raise DataError(f"{error}; {REPAIR}") from error
 
     def has(self, spec: ArraySpec) -> bool:
         """Whether the shard holds an array."""
-        return (self.path / spec.path).exists()
+        return f"{spec.path}/zarr.json" in self._files
 
     def specs(self) -> list[ArraySpec]:
         """The arrays that the shard holds, or must hold."""
-        estimated = any((self.path / path).exists() for path in QUALITY)
+        estimated = any(f"{path}/zarr.json" in self._files for path in QUALITY)
         return [s for s in SCHEMA if self.has(s) or not s.optional or (estimated and s.path in QUALITY)]
 
     def describe(self) -> list[StoredArray]:
         """Every array, its values unread."""
         paths = [*(s.path for s in SCHEMA if self.has(s)), EPISODE_ENDS]
-        arrays = {path: self._open(path) for path in paths}
-        return [
-            StoredArray(
-                path=path,
-                dims=tuple(map(str, getattr(a.metadata, "dimension_names", None) or ())),
-                shape=a.shape,
-                dtype=str(a.dtype),
-                unit=str(a.attrs.get("unit", "")),
-            )
-            for path, a in arrays.items()
-        ]
+        try:
+            return [stored_array(self._files, path) for path in paths]
+        except DataError as error:
+            raise DataError(f"{error}; {REPAIR}") from error
 
     def rows(self) -> list[slice]:
         """The rows of each episode in the ``data`` arrays."""
         ends = self.array(EPISODE_ENDS).tolist()
+        if len(ends) != len(self) or sorted({0, *ends}) != [0, *ends]:
+            raise DataError(f"{self.path}/{EPISODE_ENDS}: damaged ({shown(ends)} for {len(self)} episodes); {REPAIR}")
         return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
     def episodes(self) -> Iterator[Episode]:
         """Every episode of the shard."""
-        columns = {s.path: self.array(s.path) for s in self.specs()}
+        return self.episodes_of({s.path: self.array(s.path) for s in self.specs()})
+
+    def episodes_of(self, columns: Mapping[str, np.ndarray]) -> Iterator[Episode]:
+        """Every episode of the shard, whose arrays have been read."""
         for k, rows in enumerate(self.rows()):
             yield self._episode(k, {p: a[rows] if p.startswith("data/") else a[k] for p, a in columns.items()})
 
@@ -181,15 +144,15 @@ class Shard:
         try:
             return self._decode(k, columns)
         except (RecordError, KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{self.path}: episode {k} is damaged ({first_line(error)}); {_REDO}") from error
+            raise DataError(f"{self.path}: episode {k} is damaged ({first_line(error)}); {REPAIR}") from error
 
     def _decode(self, k: int, columns: Mapping[str, np.ndarray]) -> Episode:
-        about = self.attributes["episodes"][k]
-        entities = tuple(Entity(g, b, Role[r.upper()]) for g, b, r in self.attributes["entities"])
+        about = self.attributes.episodes[k]
+        entities = tuple(Entity(g, b, Role[r.upper()]) for g, b, r in self.attributes.entities)
         return Episode(
-            task=about["task"],
+            task=about.task,
             seed=int(columns["meta/seed"]),
-            camera=Camera.from_json(self.attributes["camera"]),
+            camera=Camera.from_json(self.attributes.camera),
             time_s=columns["data/time"],
             point_cloud=columns["data/point_cloud"],
             point_count=columns["data/point_count"],
@@ -205,7 +168,7 @@ class Shard:
             object_pose=columns.get("data/object_pose"),
             depth=columns.get("data/depth"),
             rgb=columns.get("data/rgb"),
-            extras=about["extras"],
+            extras=about.extras,
         )
 
 
@@ -215,7 +178,7 @@ def _quality(columns: Mapping[str, np.ndarray]) -> Quality | None:
     return Quality(**{path.removeprefix("data/"): columns[path] for path in QUALITY})
 
 
-_REDO = "delete the unit's receipt and run the same extract command again to make it anew"
+REPAIR = "run the command that made the dataset again, with --repair: it makes this unit anew"
 
 
 def _entities_to_json(episode: Episode) -> list[list[str]]:

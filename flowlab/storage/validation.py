@@ -6,14 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
+from flowlab.checksums import sha256_of
 from flowlab.errors import DataError
 from flowlab.provenance import Provenance
+from flowlab.records import Episode
 from flowlab.storage.checks import ArrayProblem, episode_problems
-from flowlab.storage.dataset import Dataset
+from flowlab.storage.dataset import Dataset, summaries
 from flowlab.storage.manifest import MANIFEST
 from flowlab.storage.receipts import Receipt, check_widths
-from flowlab.storage.schema import EPISODE_ENDS, SCHEMA
-from flowlab.storage.shard import Shard, episode_digest
+from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION
+from flowlab.storage.shard import REPAIR, Shard, episode_digest
+from flowlab.storage.stats import differing_stats, summarize
+from flowlab.untrusted import read_text
+from flowlab.version import __version__
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,23 +44,38 @@ def validate(path: Path) -> Iterator[Finding]:
     yield from _check_books(dataset)
     seen: dict[tuple[str, int], str] = {}
     for receipt in dataset.receipts:
-        if not receipt.accepted:
-            continue
-        place = path / receipt.shard
-        if not place.exists():
-            yield Finding(str(place), f"missing, but {path}/receipts/{receipt.unit}.json counts it; {_ANEW}")
-            continue
+        place = str(path / receipt.shard)
         for task_seed in ((receipt.task, s) for s in receipt.accepted):
             if task_seed in seen:
-                yield Finding(str(place), f"{task_seed[0]} seed {task_seed[1]} is also in {seen[task_seed]}")
-            seen[task_seed] = str(place)
-        try:
-            yield from _check_shard(dataset, receipt, Shard(place))
-        except DataError as error:
-            yield _finding(place, error)
+                yield Finding(place, f"{task_seed[0]} seed {task_seed[1]} is also in {seen[task_seed]}")
+            seen[task_seed] = place
+        yield from check_unit(dataset, receipt)
 
 
-_ANEW = "delete the receipt and run the same extract command again"
+def check_unit(dataset: Dataset, receipt: Receipt, *, contents: bool = True) -> Iterator[Finding]:
+    """Every finding about a unit: what is missing or damaged, or not what the receipt says, and then what is wrong with
+    its episodes, unless only the damage is asked for."""
+    for shard, checksum in (receipt.shard, receipt.shard_sha256), (receipt.rejects_shard, receipt.rejects_sha256):
+        place = dataset.path / shard
+        if checksum and place.is_file() and sha256_of(place) != checksum:
+            yield Finding(str(place), f"damaged (its content does not match the checksum in its receipt); {REPAIR}")
+            return
+    if any(x.position is not None for x in receipt.rejects) and not (dataset.path / receipt.rejects_shard).exists():
+        yield Finding(str(dataset.path / receipt.rejects_shard), f"missing, but {_book(dataset, receipt)}; {REPAIR}")
+    if not receipt.accepted:
+        return
+    place = dataset.path / receipt.shard
+    if not place.exists():
+        yield Finding(str(place), f"missing, but {_book(dataset, receipt)}; {REPAIR}")
+        return
+    try:
+        yield from _check_shard(dataset, receipt, Shard(place), contents)
+    except DataError as error:
+        yield _finding(place, error)
+
+
+def _book(dataset: Dataset, receipt: Receipt) -> str:
+    return f"{dataset.path}/receipts/{receipt.unit}.json counts it"
 
 
 def _finding(path: Path, error: DataError) -> Finding:
@@ -81,21 +101,40 @@ def _check_books(dataset: Dataset) -> Iterator[Finding]:
         yield _finding(path, error)
     kept = {r.rejects_shard for r in dataset.receipts if any(x.position is not None for x in r.rejects)}
     counted = kept | {r.shard for r in dataset.receipts if r.accepted}
-    for shard in sorted([*(path / "shards").glob("*.zarr"), *(path / "rejects").glob("*.zarr")]):
+    for shard in sorted([*(path / "shards").glob("*.zarr*"), *(path / "rejects").glob("*.zarr*")]):
         if str(shard.relative_to(path)) not in counted:
             yield Finding(str(shard), "has no receipt, so it does not count; run the same extract command again")
-    for name in sorted(kept):
-        if not (path / name).exists():
-            receipt = f"{path}/receipts/{Path(name).stem}.json"
-            yield Finding(f"{path}/{name}", f"missing, but {receipt} keeps a rejected episode there; {_ANEW}")
+    yield from _check_summaries(dataset)
 
 
-def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard) -> Iterator[Finding]:
+def _check_summaries(dataset: Dataset) -> Iterator[Finding]:
+    """What follows from the receipts and is stored for people: does it say what they say?"""
+    made_by = dataset.manifest.schema_version, dataset.manifest.flowlab
+    if made_by != (SCHEMA_VERSION, __version__):  # another one may put it in other words
+        return
+    try:
+        wanted = summaries(dataset)
+    except DataError:  # of widths that differ, which has been told
+        return
+    for name, text in wanted.items():
+        place = dataset.path / name
+        try:
+            found = read_text(place)
+        except DataError as error:
+            yield _finding(place, error)
+            continue
+        if found != text:
+            yield Finding(
+                str(place), "does not say what the receipts say; run the same command again, it writes it anew"
+            )
+
+
+def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard, contents: bool) -> Iterator[Finding]:
     place = str(shard.path)
-    if shard.attributes.get("settings_digest") != dataset.manifest.settings_digest:
-        yield Finding(place, f"made with other settings than {MANIFEST} states; remove it and extract again")
+    if shard.attributes.settings_digest != dataset.manifest.settings_digest:
+        yield Finding(place, f"made with other settings than {MANIFEST} states; {REPAIR}")
     if len(shard) != len(receipt.accepted):
-        yield Finding(place, f"holds {len(shard)} episodes, its receipt says {len(receipt.accepted)}; {_ANEW}")
+        yield Finding(place, f"holds {len(shard)} episodes, its receipt says {len(receipt.accepted)}; {REPAIR}")
         return
     columns, problems = {}, False
     for spec in shard.specs():
@@ -108,19 +147,29 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard) -> Iterator[F
     for problem in [] if problems else _shape_problems(dataset.manifest.provenance, columns, ends):
         problems = True
         yield _under(place, problem)
-    if problems:
-        return
-    episodes = list(shard.episodes())
+    if not problems:
+        yield from _check_episodes(dataset, receipt, place, list(shard.episodes_of(columns)), contents)
+
+
+def _check_episodes(
+    dataset: Dataset, receipt: Receipt, place: str, episodes: list[Episode], contents: bool
+) -> Iterator[Finding]:
     held = [(e.task, e.seed, len(e)) for e in episodes]
     told = [(receipt.task, *x) for x in zip(receipt.accepted, receipt.frames, strict=True)]
     if held != told:
-        yield Finding(place, f"holds (task, seed, frames) {held}, its receipt says {told}; {_ANEW}")
+        yield Finding(place, f"holds (task, seed, frames) {held}, its receipt says {told}; {REPAIR}")
         return
-    for episode, digest in zip(episodes, receipt.digests, strict=True):
-        for problem in episode_problems(episode, dataset.manifest.provenance):
-            yield _under(place, problem, f"seed {episode.seed}: ")
-        if episode_digest(episode) != digest:
-            yield Finding(place, f"seed {episode.seed}: content differs from what its receipt says; {_ANEW}")
+    changed = [e for e, digest in zip(episodes, receipt.digests, strict=True) if episode_digest(e) != digest]
+    for episode in changed:
+        yield Finding(place, f"seed {episode.seed}: content differs from what its receipt says; {REPAIR}")
+    problems = [(e, p) for e in episodes for p in episode_problems(e, dataset.provenance)] if contents else []
+    for episode, problem in problems:
+        yield _under(place, problem, f"seed {episode.seed}: ")
+    if changed or problems:
+        return
+    if different := differing_stats(receipt.stats, summarize(episodes)):
+        path = dataset.path / "receipts" / f"{receipt.unit}.json"
+        yield Finding(str(path), f"stats.{different}: is not what the episodes of {place} have; {REPAIR}")
 
 
 def _shape_problems(known: Provenance, columns: dict[str, np.ndarray], ends: np.ndarray) -> Iterator[ArrayProblem]:

@@ -96,7 +96,7 @@ def experiment(recipe: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unit(out: Path, name: str) -> dict[str, Any]:
     """Without its digest."""
     values = json.loads((out / f"units/{name}.json").read_text())
-    assert values.pop("digest")
+    assert values.pop("sha256")
     return values
 
 
@@ -134,7 +134,7 @@ def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: 
             assert e["n_action_steps"] == 8
             log = run / f"evaluation/step-{e['step']:08d}-execute-8/episodes.jsonl"
             lines = [json.loads(line) for line in log.read_text().splitlines()]
-            assert all(line.pop("digest") for line in lines)
+            assert all(line.pop("sha256") for line in lines)
             assert sorted(lines, key=lambda x: x["episode"]) == e["outcomes"]
 
 

@@ -15,11 +15,11 @@ import pytest
 from builders import random_buffer
 from synthetic import files_below, make_dataset, make_episode, with_quality
 
+from flowlab.checksums import with_checksum
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.data.windows import Windows
 from flowlab.errors import DataError
-from flowlab.json_lines import seal
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.dp3 import DP3Exporter
@@ -182,8 +182,8 @@ def forge(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
     def damage(path: Path) -> None:
         values = json.loads((path.parent / "index.json").read_text())
         change(values)
-        values.pop("digest", None)
-        (path.parent / "index.json").write_text(json.dumps(seal(values)))
+        values.pop("sha256", None)
+        (path.parent / "index.json").write_text(json.dumps(with_checksum(values)))
 
     return damage
 
@@ -241,7 +241,7 @@ def test_an_episode_that_is_not_as_its_receipt_says_is_refused(tmp_path: Path) -
         [replace(episodes[0], state=episodes[0].state + 1), *episodes[1:3]],
         dataset.manifest.settings_digest,
     )
-    with pytest.raises(DataError, match=r"seed 0 differs from what its receipt says; 'flowlab validate .*' tells"):
+    with pytest.raises(DataError, match=r"seed 0: content differs from what its receipt says"):
         load_buffer(open_training_source(tmp_path / "d"), tmp_path / "run")
 
 

@@ -76,7 +76,7 @@ def evaluate(capsys: Capture, *arguments: str | Path | int) -> str:
 def lines_of(run: Path, place: str = PLACE) -> list[dict[str, Any]]:
     """Without their digests."""
     lines = [json.loads(line) for line in (run / place).read_text().splitlines()]
-    assert all(line.pop("digest") for line in lines)
+    assert all(line.pop("sha256") for line in lines)
     return lines
 
 
@@ -299,7 +299,7 @@ def test_runs_without_a_common_task(fdp: Path, tmp_path: Path, capsys: Capture) 
     other = copy(fdp, tmp_path, "other")
     about = policy_of(other)
     about["policy"]["tasks"] = ["hammer", "push"]
-    about.pop("digest")
+    about.pop("sha256")
     (other / "policy.json").write_text(json.dumps(about))
     code, err = refused(capsys, fdp, other)
     assert code == 2

@@ -13,10 +13,10 @@ from synthetic import call_cli
 from thoroughness import examples
 from trained_runs import SMALL, make_rolls, make_run, options
 
+from flowlab.checksums import with_checksum
 from flowlab.evaluation.episode_log import append_result
 from flowlab.evaluation.results import EpisodeResult
 from flowlab.evaluation.validation import validate_run
-from flowlab.json_lines import seal
 
 Capture = pytest.CaptureFixture[str]
 OLD = Path(__file__).parents[1] / "fixtures/old/runs"
@@ -75,8 +75,8 @@ def spoil(path: Path) -> None:
 
 
 def rewrite(path: Path, **changes: object) -> None:
-    values = {k: v for k, v in json.loads(path.read_text()).items() if k != "digest"}
-    path.write_text(json.dumps(seal({**values, **changes}, ("dataset",) if path.name == "run.json" else ())))
+    values = {k: v for k, v in json.loads(path.read_text()).items() if k != "sha256"}
+    path.write_text(json.dumps(with_checksum({**values, **changes}, ("dataset",) if path.name == "run.json" else ())))
 
 
 PROBLEMS: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -122,7 +122,7 @@ def test_of_a_run_without_digests_that_is_said(run: Path, tmp_path: Path, capsys
     assert f"{old}/run.json: dataset: " in out
     work = Path(shutil.copytree(run, tmp_path / "run"))
     for path in (work / "policy.json", work / "run.json"):
-        path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "digest"}))
+        path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "sha256"}))
     assert call_cli(capsys, "validate", work) == (
-        0, f"{work}: sound; of an earlier version, without digests, so a changed number is not found\n", ""
+        0, f"{work}: sound; of an earlier version, without checksums: a changed number is not found\n", ""
     )  # fmt: skip

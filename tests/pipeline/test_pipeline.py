@@ -94,7 +94,7 @@ def test_tallies_count_calls_and_rejects_of_every_stage(tmp_path: Path) -> None:
     counts = {name: (t.calls, t.rejects) for name, t in pipeline.tallies.items()}
     assert counts == {"source": (5, 0), "only-even": (5, 2), "write": (3, 0)}
     before = dict(pipeline.tallies)
-    pipeline.store(tmp_path / "unit.zarr", episodes, "")
+    pipeline.store(tmp_path / "unit.zarr.zip", episodes, "")
     since = pipeline.tallies["write"].since(before["write"])
     assert (since.calls, since.rejects) == (0, 0)
     assert since.cpu_s > 0
@@ -117,8 +117,8 @@ def test_write_stores_pictures_only_if_asked(tmp_path: Path, depth: bool, rgb: b
     made = pipeline.run(EpisodeRequest(task="roll", seed=3))
     source = make_episode(3, depth=True, rgb=True)
     assert_same(made, replace(source, depth=source.depth if depth else None, rgb=source.rgb if rgb else None))
-    pipeline.store(tmp_path / "unit.zarr", [made], "settings")
-    assert_same(Shard(tmp_path / "unit.zarr").episode(0), made)
+    pipeline.store(tmp_path / "unit.zarr.zip", [made], "settings")
+    assert_same(Shard(tmp_path / "unit.zarr.zip").episode(0), made)
 
 
 @pytest.mark.parametrize(("solved", "asked", "passes"), [(5, 5, True), (4, 5, False), (0, 0, True), (12, 13, False)])
@@ -183,11 +183,11 @@ def test_a_second_try_at_a_unit_leaves_nothing_of_the_first(tmp_path: Path) -> N
     (tmp_path / "receipts").mkdir()
     unit = WorkUnit(task="roll", seeds=(1,))
     run_unit(STAGES_HERE % "Kept", None, "digest", tmp_path, unit)
-    assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["rejects"]
+    assert [p.parent.name for p in tmp_path.glob("*/*.zarr.zip")] == ["rejects"]
     run_unit(STAGES_HERE % "AsItIs", None, "digest", tmp_path, unit)
-    assert [p.parent.name for p in tmp_path.glob("*/*.zarr")] == ["shards"]
+    assert [p.parent.name for p in tmp_path.glob("*/*.zarr.zip")] == ["shards"]
     run_unit(STAGES_HERE % "OnlyEven", None, "digest", tmp_path, unit)
-    assert list(tmp_path.glob("*/*.zarr")) == []
+    assert list(tmp_path.glob("*/*.zarr.zip")) == []
 
 
 class AsItIs(Stage):

@@ -20,8 +20,11 @@ from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler, 
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.storage.receipts import Receipt, Reject, keep_receipt, read_receipts
 from flowlab.storage.recorded import Recorded
+from flowlab.storage.stats import merge
 
 TASKS = ("push", "roll")
+
+NO_STATS = merge([])
 
 
 class CutOff(Exception):
@@ -43,7 +46,7 @@ class World:
         self.tried += [(share, unit.task, s) for s in unit.seeds]
         receipt = Receipt(
             unit=unit.name, task=unit.task, seeds=unit.seeds, accepted=accepted,
-            frames=(1,) * len(accepted), digests=("",) * len(accepted),
+            frames=(1,) * len(accepted), digests=("",) * len(accepted), stats=NO_STATS,
         )  # fmt: skip
         keep_receipt(self.folder, receipt)
         return receipt
@@ -288,9 +291,9 @@ def test_a_recording_is_a_unit_that_says_where_it_lies() -> None:
 def test_progress_is_that_of_the_recordings_of_this_run() -> None:
     poor = Reject(task="roll", seed=1, stage="quality", reason="poor")
     receipts = [
-        Receipt(unit="push-000000", task="push", seeds=(0,), accepted=(0,), frames=(1,), digests=("",)),
+        Receipt(unit="push-000000", task="push", seeds=(0,), accepted=(0,), frames=(1,), digests=("",), stats=NO_STATS),
         Receipt(unit="roll-000001", task="roll", seeds=(1,), accepted=(), frames=(), digests=(), rejects=(poor,)),
-        Receipt(unit="roll-000003", task="roll", seeds=(3,), accepted=(3,), frames=(1,), digests=("",)),
+        Receipt(unit="roll-000003", task="roll", seeds=(3,), accepted=(3,), frames=(1,), digests=("",), stats=NO_STATS),
     ]
     assert RecordingScheduler(recordings(3)).progress(receipts) == ExtractionProgress(1, 3, 1)
 

@@ -33,13 +33,13 @@ from trained_runs import (
 )
 
 import flowlab
+from flowlab.checksums import with_checksum
 from flowlab.data.batch_builder import BatchBuilder
 from flowlab.data.batches import Batch
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
 from flowlab.data.window_sampler import index_windows
 from flowlab.errors import DataError
-from flowlab.json_lines import seal
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import RESUME, load_policy
 from flowlab.storage.dataset import Dataset
@@ -182,7 +182,7 @@ def test_weights_of_another_shape_are_refused(run: Path, tmp_path: Path, capsys:
 
 def rewrite(path: Path, values: dict[str, Any]) -> None:
     """Write a run's JSON with the digest of its content, as somebody might who means it."""
-    path.write_text(json.dumps(seal({k: v for k, v in values.items() if k != "digest"})))
+    path.write_text(json.dumps(with_checksum({k: v for k, v in values.items() if k != "sha256"})))
 
 
 def cut(path: Path) -> None:

@@ -11,12 +11,23 @@ from pathlib import Path
 
 import pytest
 from conftest import Cli
-from synthetic import assert_same, files_below, make_dataset, make_episode, make_manifest, make_receipt, with_quality
+from synthetic import (
+    assert_same,
+    edit_json,
+    files_below,
+    make_dataset,
+    make_episode,
+    make_manifest,
+    make_receipt,
+    put_unit,
+    with_quality,
+)
 
+from flowlab.checksums import sha256_of
 from flowlab.errors import DataError, UsageError
 from flowlab.storage.dataset import Dataset, begin, open_dataset, summarize
 from flowlab.storage.manifest import MANIFEST
-from flowlab.storage.receipts import Receipt, Reject, StageTally, keep_receipt
+from flowlab.storage.receipts import Receipt, Reject, StageTally, keep_receipt, shard_path
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.shard import Shard, write_shard
 from flowlab.storage.validation import validate
@@ -156,7 +167,7 @@ def test_a_request_never_shrinks(tmp_path: Path) -> None:
 
 def change_manifest(folder: Path, **values: object) -> None:
     path = folder / MANIFEST
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+    edit_json(path, lambda m: m.update(values))
 
 
 def break_receipt(folder: Path) -> None:
@@ -165,21 +176,23 @@ def break_receipt(folder: Path) -> None:
 
 def strip_receipt(folder: Path) -> None:
     path = folder / "receipts" / "roll-000000-000001.json"
-    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "digests"}))
+    path.write_text(
+        json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k not in ("digests", "sha256")})
+    )
 
 
 HARMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder": (shutil.rmtree, "{0}: there is no such folder"),
     "no manifest": (lambda d: (d / MANIFEST).unlink(), "{0}: not a flowlab dataset (it has no flowlab.json)"),
     "broken manifest": (lambda d: (d / MANIFEST).write_text("{"), "{0}/flowlab.json: not valid JSON (*restore it*"),
-    "binary manifest": (lambda d: (d / MANIFEST).write_bytes(b"\xff\xfe"), "{0}/flowlab.json: not valid JSON (*"),
+    "binary manifest": (lambda d: (d / MANIFEST).write_bytes(b"\xff\xfe"), "{0}/flowlab.json: is no UTF-8 text (*"),
     "newer flowlab": (
-        lambda d: change_manifest(d, schema_version=2),
-        "{0}/flowlab.json: schema_version is 2, this flowlab reads 1; use the flowlab version that wrote it",
+        lambda d: change_manifest(d, schema_version=3),
+        "{0}/flowlab.json: schema_version is 3, this flowlab reads 1 and 2; use the flowlab version that wrote it",
     ),
-    "unknown field": (lambda d: change_manifest(d, color=1), "{0}/flowlab.json: field 'color': *"),
+    "unknown field": (lambda d: change_manifest(d, color=1), "{0}/flowlab.json: color: no setting is called *"),
     "broken receipt": (break_receipt, "{0}/receipts/roll-000000-000001.json: not valid JSON (*"),
-    "receipt without digests": (strip_receipt, "{0}/receipts/roll-000000-000001.json: field 'digests': *"),
+    "receipt without digests": (strip_receipt, "{0}/receipts/roll-000000-000001.json: digests: Field required*"),
     "file": (lambda d: (shutil.rmtree(d), d.touch()), "{0}: not a flowlab dataset *"),
 }
 
@@ -268,12 +281,12 @@ def test_extending_a_dataset_leaves_what_it_has(small_dataset: Path, tmp_path: P
     after = files_below(data)
     assert {n: after[n] for n in before} == before
     added = {Path(n).parts[1] for n in after if n.startswith("shards")} - {Path(n).parts[1] for n in before}
-    assert added == {"drawer-open-000003.zarr"}
+    assert added == {"drawer-open-000003.zarr.zip"}
     dataset = Dataset(data)
     assert dataset.manifest.requested == {"drawer-open": 4, "push-back": 3}
     assert [r.seed for r in dataset.refs if r.task == "drawer-open"] == [0, 1, 2, 3]
     assert json.loads((data / "stats.json").read_text())["episodes"] == 7
-    assert [e.seed for e in Shard(data / "shards/drawer-open-000003.zarr").episodes()] == [3]
+    assert [e.seed for e in Shard(data / "shards/drawer-open-000003.zarr.zip").episodes()] == [3]
 
 
 def test_a_shard_without_receipt_does_not_count(tmp_path: Path) -> None:
@@ -325,8 +338,8 @@ from synthetic import make_manifest
 import flowlab.storage.dataset as dataset
 from flowlab.storage.recorded import Recorded
 
-at_once = dataset.write_json
-dataset.write_json = lambda *a: (time.sleep(0.3), at_once(*a))  # so that the others come in between
+at_once = dataset.Manifest.write
+dataset.Manifest.write = lambda *a: (time.sleep(0.3), at_once(*a))  # so that the others come in between
 name = sys.argv[2]
 print(flush=True)
 sys.stdin.read()
@@ -361,13 +374,14 @@ def test_what_was_rejected_can_be_listed_and_looked_at(tmp_path: Path) -> None:
         reject(2, "recording"),
         reject(1, "quality", position=1),
     )
-    receipt = make_receipt([make_episode(0)], unit="roll-000000-000003", seeds=(0, 3, 2, 1), rejects=rejects)
-    write_shard(tmp_path / receipt.shard, [make_episode(0)], "")
-    write_shard(tmp_path / receipt.rejects_shard, poor, "")
-    keep_receipt(tmp_path, receipt)
+    unit = "roll-000000-000003"
+    write_shard(tmp_path / shard_path("rejects", unit), poor, "")
+    known = {"seeds": (0, 3, 2, 1), "rejects": rejects}
+    known["rejects_sha256"] = sha256_of(tmp_path / shard_path("rejects", unit))
+    put_unit(tmp_path, [make_episode(0)], "", unit=unit, **known)
     dataset = summarize(tmp_path)
     found = [(x.task, x.seed, x.stage, x.reason, x.source, x.shard) for x in dataset.rejects]
-    kept = "rejects/roll-000000-000003.zarr"
+    kept = "rejects/roll-000000-000003.zarr.zip"
     assert found == [
         ("roll", 1, "quality", "because 1", "", kept),
         ("roll", 2, "recording", "because 2", "", None),

@@ -86,10 +86,11 @@ def test_what_exists_is_not_overwritten(small_dataset: Path, tmp_path: Path, flo
 
 def test_a_damaged_dataset_leaves_no_store(tmp_path: Path, flowlab: Cli) -> None:
     dataset = make_dataset(tmp_path / "d", [[make_episode(0)], [make_episode(1)]])
-    (tmp_path / "d" / dataset.receipts[1].shard / "data/state/c/0/0").unlink()
+    shard = tmp_path / "d" / dataset.receipts[1].shard
+    shard.write_bytes(shard.read_bytes()[:-99])
     result = flowlab("export", tmp_path / "d", "--to", "dp3", "--out", tmp_path / "s")
     assert result.returncode == 3
-    assert "data/state: 1 of 1 chunks missing" in result.stderr
+    assert f"{shard}: not a readable shard" in result.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
 
 

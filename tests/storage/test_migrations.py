@@ -158,4 +158,4 @@ def test_a_damaged_old_manifest_is_one_sentence(
     (data / MANIFEST).write_text(json.dumps(values | damage))
     code, _, errors = call_cli(capsys, "info", data)
     assert code in (0, 3)
-    assert code == 0 or errors.startswith(f"flowlab: {data / MANIFEST}: field '")
+    assert code == 0 or errors.startswith(f"flowlab: {data / MANIFEST}: ")

@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,8 +18,9 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import Zstd
-from synthetic import CAMERA, assert_same, make_episode, with_quality
+from synthetic import CAMERA, assert_same, make_episode, unzipped, with_quality
 from thoroughness import examples
+from zarr.storage import ZipStore
 
 from flowlab.errors import DataError
 from flowlab.files import remove_leftovers
@@ -84,7 +86,7 @@ def test_episodes_come_back_bit_for_bit(
     extras: dict[str, Any],
     seed: int,
 ) -> None:
-    path = tmp_path_factory.mktemp("shard") / "unit.zarr"
+    path = tmp_path_factory.mktemp("shard") / "unit.zarr.zip"
     made = [make_episode(seed + k, steps=n, points=points, queries=queries, **options) for k, n in enumerate(lengths)]
     made = [replace(scrambled(with_quality(e, e.seed) if estimated else e, e.seed), extras=extras) for e in made]
     write_shard(path, made, "digest")
@@ -102,9 +104,21 @@ def episodes() -> list[Episode]:
 
 
 @pytest.fixture
-def path(tmp_path: Path, episodes: list[Episode]) -> Path:
-    write_shard(tmp_path / "unit.zarr", episodes, "digest")
-    return tmp_path / "unit.zarr"
+def zipped(tmp_path: Path, episodes: list[Episode]) -> Path:
+    write_shard(tmp_path / "unit.zarr.zip", episodes, "digest")
+    return tmp_path / "unit.zarr.zip"
+
+
+@pytest.fixture
+def path(zipped: Path) -> Path:
+    """The shard as a folder, whose files can be looked at, and damaged."""
+    return unzipped(zipped)
+
+
+def put(folder: Path, episodes: list[Episode]) -> Path:
+    """A shard that is a folder."""
+    write_shard(folder.with_name(f"{folder.name}.zip"), episodes, "")
+    return unzipped(folder.with_name(f"{folder.name}.zip"))
 
 
 def test_what_lies_on_disk_is_documented_zarr_v3(path: Path) -> None:
@@ -147,7 +161,7 @@ def test_chunks_decode_by_hand_and_carry_a_right_checksum(path: Path, episodes: 
 
 def test_long_shards_are_cut_into_chunks(tmp_path: Path) -> None:
     long = make_episode(0, steps=2 * STEPS_PER_CHUNK + 3, points=4, queries=2)
-    write_shard(tmp_path / "long.zarr", [long], "")
+    put(tmp_path / "long.zarr", [long])
     assert sorted(p.name for p in (tmp_path / "long.zarr/data/tracks/c").iterdir()) == ["0", "1", "2"]
     meta = json.loads((tmp_path / "long.zarr/data/tracks/zarr.json").read_text())
     assert meta["chunk_grid"]["configuration"]["chunk_shape"] == [STEPS_PER_CHUNK, 2, 3]
@@ -175,7 +189,7 @@ def empty(file: Path) -> None:
 def test_a_damaged_chunk_is_an_error_that_names_the_array(path: Path, chunk: str, harm: Callable[[Path], None]) -> None:
     harm(path / chunk)
     array = chunk.partition("/c/")[0]
-    with pytest.raises(DataError, match=rf"{path}/{array}: .*(damaged|missing).*; delete the unit's receipt"):
+    with pytest.raises(DataError, match=rf"{path}/{array}: .*(damaged|missing).*.*with --repair"):
         list(Shard(path).episodes())
     with pytest.raises(DataError, match=f"{path}/{array}: "):
         Shard(path).episode(1)
@@ -189,7 +203,7 @@ def test_a_missing_array_is_an_error_that_names_it(path: Path, array: str) -> No
 
 
 def test_of_the_arrays_of_quality_none_may_be_missing(tmp_path: Path) -> None:
-    write_shard(tmp_path / "unit.zarr", [with_quality(make_episode())], "")
+    put(tmp_path / "unit.zarr", [with_quality(make_episode())])
     shutil.rmtree(tmp_path / "unit.zarr/data/source")
     with pytest.raises(DataError, match="data/source: the array is missing"):
         Shard(tmp_path / "unit.zarr").episode(0)
@@ -202,8 +216,8 @@ def test_a_recording_without_a_robot_is_stored_too(tmp_path: Path) -> None:
     """Neither state nor action: arrays with rows, and nothing in them."""
     nothing = np.zeros((12, 0), np.float32)
     watched = replace(make_episode(), state=nothing, action=nothing)
-    write_shard(tmp_path / "unit.zarr", [watched], "")
-    assert_same(watched, Shard(tmp_path / "unit.zarr").episode(0))
+    write_shard(tmp_path / "unit.zarr.zip", [watched], "")
+    assert_same(watched, Shard(tmp_path / "unit.zarr.zip").episode(0))
 
 
 def test_describing_a_shard_that_lacks_an_array_says_so(path: Path) -> None:
@@ -224,7 +238,7 @@ def test_a_broken_group_is_an_error_that_names_the_shard(path: Path, content: st
 def test_values_that_are_all_zero_are_stored_all_the_same(tmp_path: Path) -> None:
     """Otherwise a lost chunk could pass for one that was never written."""
     failed = replace(make_episode(0), success=np.zeros(12, bool))
-    write_shard(tmp_path / "unit.zarr", [failed], "")
+    put(tmp_path / "unit.zarr", [failed])
     assert (tmp_path / "unit.zarr/data/success/c/0").stat().st_size > 0
     assert not Shard(tmp_path / "unit.zarr").episode(0).success.any()
     (tmp_path / "unit.zarr/data/success/c/0").unlink()
@@ -232,13 +246,17 @@ def test_values_that_are_all_zero_are_stored_all_the_same(tmp_path: Path) -> Non
         Shard(tmp_path / "unit.zarr").episode(0)
 
 
-def test_writing_onto_a_shard_replaces_it(path: Path, episodes: list[Episode]) -> None:
+def test_writing_onto_a_shard_replaces_it(zipped: Path) -> None:
     other = make_episode(5, steps=7, object_pose=False)
-    write_shard(path, [other], "digest")
-    assert [e.seed for e in Shard(path).episodes()] == [5]
-    assert_same(other, Shard(path).episode(0))
-    assert not (path / "data/object_pose").exists()
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    write_shard(zipped, [other], "digest")
+    assert [e.seed for e in Shard(zipped).episodes()] == [5]
+    assert_same(other, Shard(zipped).episode(0))
+    assert [p.name for p in zipped.parent.iterdir()] == [zipped.name]
+
+
+def test_the_same_episodes_give_the_same_bytes(tmp_path: Path, zipped: Path, episodes: list[Episode]) -> None:
+    write_shard(tmp_path / "again.zarr.zip", episodes, "digest")
+    assert (tmp_path / "again.zarr.zip").read_bytes() == zipped.read_bytes()
 
 
 MIXED = {
@@ -253,14 +271,14 @@ MIXED = {
 @pytest.mark.parametrize("what", MIXED)
 def test_episodes_that_do_not_go_together_are_refused(tmp_path: Path, episodes: list[Episode], what: str) -> None:
     with pytest.raises(DataError, match="one shard"):
-        write_shard(tmp_path / "unit.zarr", [episodes[0], MIXED[what](episodes[1])], "")
+        write_shard(tmp_path / "unit.zarr.zip", [episodes[0], MIXED[what](episodes[1])], "")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_digest_of_an_episode_does_not_depend_on_its_shard(tmp_path: Path, episodes: list[Episode]) -> None:
     for k, group in enumerate([episodes, episodes[1:], episodes[::-1]]):
-        write_shard(tmp_path / f"{k}.zarr", group, str(k))
-    digests = [{e.seed: episode_digest(e) for e in Shard(tmp_path / f"{k}.zarr").episodes()} for k in range(3)]
+        write_shard(tmp_path / f"{k}.zarr.zip", group, str(k))
+    digests = [{e.seed: episode_digest(e) for e in Shard(tmp_path / f"{k}.zarr.zip").episodes()} for k in range(3)]
     assert digests[0] == digests[2]
     assert digests[0][1] == digests[1][1] == episode_digest(episodes[1])
     assert digests[0][0] != digests[0][1]
@@ -308,37 +326,34 @@ from flowlab.storage.shard import write_shard
 
 folder, rounds, over = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "over"
 rng = random.Random(0)
-write_bytes = Path.write_bytes
 
-def die_at_file(number):
+def die_at(number):
+    # at the n-th time that a file is brought to the disk or to its name
     left = [number]
-    def write(path, content):
-        left[0] -= 1
-        if not left[0]:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return write_bytes(path, content)
-    Path.write_bytes = write
+    def counted(function):
+        def call(*a):
+            left[0] -= 1
+            if not left[0]:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*a)
+        return call
+    os.fsync, os.replace = counted(os.fsync), counted(os.replace)
 
 old, new = (make_episode(k, steps=300) for k in (1, 2))
 for name in ["../warm", *(range(rounds) if over else ())]:
-    write_shard(folder / f"{name}.zarr", [old], "")
+    write_shard(folder / f"{name}.zarr.zip", [old], "")
 for k in range(rounds):
     pid = os.fork()
     if not pid:
-        if k % 4 == 0:  # at a file of its own, so that some are hit as they write on the busiest machine
-            die_at_file(1 + 2 * k)
-        write_shard(folder / f"{k}.zarr", [new], "")
+        if k % 4 == 0:  # so that some are hit as they write on the busiest machine
+            die_at(1 + k // 4 % 3)
+        write_shard(folder / f"{k}.zarr.zip", [new], "")
         os._exit(0)
     while not (begun := any(str(pid) in name for name in os.listdir(folder))):
         if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
             break
-    if begun and k < rounds - 1:  # the last may live
-        if k % 2:  # so that half are hit near the end, where the shard comes to its place
-            while any(not (folder / n / "meta/episode_ends/c/0").exists() for n in os.listdir(folder) if str(pid) in n):
-                pass
-            time.sleep(rng.uniform(0, 0.003))
-        else:
-            time.sleep(rng.uniform(0, 0.008))
+    if begun and k % 4 and k < rounds - 1:  # the last may live
+        time.sleep(rng.uniform(0, 0.003))
         os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
 """
@@ -354,7 +369,7 @@ def test_a_writer_that_is_killed_leaves_a_whole_shard_or_none(tmp_path: Path, ov
     command = [sys.executable, script, folder, str(rounds), "over" if over else "fresh"]
     subprocess.run(command, env=ENVIRONMENT, check=True, timeout=120)
     old, new = (episode_digest(make_episode(k, steps=300)) for k in (1, 2))
-    shards = [p for k in range(rounds) if (p := folder / f"{k}.zarr").exists()]
+    shards = [p for k in range(rounds) if (p := folder / f"{k}.zarr.zip").exists()]
     assert {episode_digest(Shard(p).episode(0)) for p in shards} <= {old, new}
     assert any(folder.glob(".tmp-*")), "no writer was killed as it wrote: nothing was tested"
     remove_leftovers(folder)
@@ -366,16 +381,17 @@ import socket, sys
 from pathlib import Path
 machine = sys.argv[2] or socket.gethostname()
 socket.gethostname = lambda: machine
-import flowlab.storage.shard as shard
+import flowlab.files as files
+from flowlab.storage.shard import write_shard
 from synthetic import make_episode
 
 def stop(*_):
     print(flush=True)
     sys.stdin.read()
-    shard.os._exit(0)
+    files.os._exit(0)
 
-shard.os.rename = stop
-shard.write_shard(Path(sys.argv[1]) / "unit.zarr", [make_episode()], "")
+files.os.replace = stop
+write_shard(Path(sys.argv[1]) / "unit.zarr.zip", [make_episode()], "")
 """
 
 
@@ -391,13 +407,13 @@ def leave_half(folder: Path, machine: str = "") -> tuple[Path, subprocess.Popen[
 
 
 def test_leftovers_of_the_dead_go_and_those_of_the_living_stay(tmp_path: Path) -> None:
-    write_shard(tmp_path / "other.zarr", [make_episode()], "")
+    write_shard(tmp_path / "other.zarr.zip", [make_episode()], "")
     left, writer = leave_half(tmp_path)
     remove_leftovers(tmp_path)
-    assert set(tmp_path.iterdir()) == {left, tmp_path / "other.zarr"}
+    assert set(tmp_path.iterdir()) == {left, tmp_path / "other.zarr.zip"}
     writer.communicate()
     remove_leftovers(tmp_path)
-    assert set(tmp_path.iterdir()) == {tmp_path / "other.zarr"}
+    assert set(tmp_path.iterdir()) == {tmp_path / "other.zarr.zip"}
 
 
 @pytest.mark.parametrize("suffix", ["-b", "-99999999", "b"])
@@ -415,7 +431,7 @@ from pathlib import Path
 from synthetic import make_episode
 from flowlab.storage.shard import write_shard
 for _ in range(12):
-    write_shard(Path(sys.argv[1]) / "unit.zarr", [make_episode()], "")
+    write_shard(Path(sys.argv[1]) / "unit.zarr.zip", [make_episode()], "")
 """
 
 
@@ -426,14 +442,111 @@ def test_two_jobs_may_write_the_same_shard(tmp_path: Path) -> None:
         for _ in range(3)
     ]
     assert [job.communicate()[1].decode()[-500:] for job in jobs] == [""] * 3
-    assert_same(make_episode(), Shard(tmp_path / "unit.zarr").episode(0))
-    assert [p.name for p in tmp_path.iterdir()] == ["unit.zarr"]
+    assert_same(make_episode(), Shard(tmp_path / "unit.zarr.zip").episode(0))
+    assert [p.name for p in tmp_path.iterdir()] == ["unit.zarr.zip"]
 
 
-def test_other_zarr_readers_see_plain_arrays(path: Path, episodes: list[Episode]) -> None:
-    group = zarr.open_group(path, mode="r")
+@pytest.mark.parametrize("form", ["zip", "folder"])
+def test_other_zarr_readers_see_plain_arrays(zipped: Path, form: str, episodes: list[Episode]) -> None:
+    group = zarr.open_group(unzipped(zipped) if form == "folder" else ZipStore(zipped, mode="r"), mode="r")
     tracks, ends = group["data/tracks"], group["meta/episode_ends"]
     assert isinstance(tracks, zarr.Array)
     assert isinstance(ends, zarr.Array)
     assert np.array_equal(ends[...], [10, 30])
     assert np.array_equal(tracks[10:30], episodes[1].tracks.xyz_world)
+
+
+def test_every_array_is_what_zarr_reads(zipped: Path) -> None:
+    group, shard = zarr.open_group(ZipStore(zipped, mode="r"), mode="r"), Shard(zipped)
+    for spec in shard.specs():
+        array = group[spec.path]
+        assert isinstance(array, zarr.Array)
+        for rows in (slice(None), slice(1, 2), slice(0, 1)):
+            assert_same(np.asarray(array[rows]), shard.array(spec.path, rows), spec.path)
+
+
+@settings(max_examples=examples(200), deadline=None)
+@given(data=st.data())
+def test_a_flipped_bit_is_an_error_or_changes_nothing(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder, made = tmp_path_factory.mktemp("flip"), [make_episode(k, steps=5, points=6, queries=3) for k in range(2)]
+    path = folder / "unit.zarr.zip"
+    write_shard(path, made, "digest")
+    content = bytearray(path.read_bytes())
+    content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(content)
+    try:
+        found = list(Shard(path).episodes())
+    except DataError:
+        return
+    for a, b in zip(made, found, strict=True):
+        assert_same(a, b)
+
+
+def rezipped(path: Path, change: Callable[[dict[str, bytes]], object], **how: int) -> None:
+    """The shard as a stranger could make it."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    change(files)
+    with zipfile.ZipFile(path, "w", **how) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+
+
+def claim(array: str, **values: object) -> Callable[[dict[str, bytes]], object]:
+    name = f"{array}/zarr.json"
+    return lambda files: files.update({name: json.dumps(json.loads(files[name]) | values).encode()})
+
+
+def grid(*shape: int) -> dict[str, object]:
+    return {"name": "regular", "configuration": {"chunk_shape": list(shape)}}
+
+
+BOMBS: dict[str, Callable[[dict[str, bytes]], object]] = {
+    "more rows than there are": claim("data/tracks", shape=[10**12, 8, 3]),
+    "a chunk of a terabyte": claim("data/tracks", shape=[10**12, 8, 3], chunk_grid=grid(10**12, 8, 3)),
+    "rows as wide as the world": claim("data/tracks", shape=[30, 10**9, 3], chunk_grid=grid(30, 10**9, 3)),
+    "no shape": claim("data/tracks", shape=[]),
+    "a negative shape": claim("data/tracks", shape=[-1, 8, 3]),
+    "text for a shape": claim("data/tracks", shape="many"),
+    "another codec": claim("data/tracks", codecs=[{"name": "numcodecs.pickle"}]),
+    "codecs that are none": claim("data/tracks", codecs=3),
+    "objects": claim("data/tracks", data_type="object"),
+    "a type that is none": claim("data/tracks", data_type={"name": "x"}),
+    "a list for an array": lambda files: files.update({"data/tracks/zarr.json": b"[]"}),
+    "metadata nested deep": lambda files: files.update({"zarr.json": b"[" * 10_000}),
+    "episodes that are none": lambda files: files.update({"zarr.json": b'{"attributes": {"episodes": 3}}'}),
+    "a camera that is none": lambda files: files.update(
+        {"zarr.json": json.dumps(_with_attributes(files, camera={"width": "x"})).encode()}
+    ),
+    "entities that are none": lambda files: files.update(
+        {"zarr.json": json.dumps(_with_attributes(files, entities=[["a", "b", "nobody"]])).encode()}
+    ),
+}
+
+
+def _with_attributes(files: dict[str, bytes], **values: object) -> dict[str, object]:
+    group = json.loads(files["zarr.json"])
+    return group | {"attributes": group["attributes"] | values}
+
+
+@pytest.mark.parametrize("what", BOMBS)
+def test_a_shard_that_claims_what_it_is_not_is_one_sentence(zipped: Path, what: str) -> None:
+    rezipped(zipped, BOMBS[what])
+    with pytest.raises(DataError, match=str(zipped)) as error:
+        list(Shard(zipped).episodes())
+    assert len(str(error.value)) < 800
+
+
+def test_a_zip_that_would_unpack_is_refused(zipped: Path) -> None:
+    rezipped(zipped, lambda files: None, compression=zipfile.ZIP_DEFLATED)
+    with pytest.raises(DataError, match="expected a zip that only stores"):
+        Shard(zipped)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"no zip at all" * 100])
+def test_what_is_no_zip_is_one_sentence(zipped: Path, content: bytes) -> None:
+    zipped.write_bytes(content)
+    with pytest.raises(DataError, match=r"not a readable shard .*with --repair"):
+        Shard(zipped)

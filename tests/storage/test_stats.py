@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import make_dataset, make_episode, make_manifest, with_quality, with_tracks
 from thoroughness import examples
+from zarr.storage import ZipStore
 
 from flowlab.records import Episode, PositionSource
 from flowlab.storage import stats
@@ -126,8 +127,8 @@ def test_statistics_of_a_real_dataset_follow_from_its_arrays(small_dataset: Path
     """Read with plain zarr, cut at the stored ends."""
     parts: dict[str, list[np.ndarray]] = {name: [] for name in ARRAYS}
     steps, traveled = [], []
-    for path in sorted((small_dataset / "shards").glob("*.zarr")):
-        group = zarr.open_group(path, mode="r")
+    for path in sorted((small_dataset / "shards").glob("*.zarr.zip")):
+        group = zarr.open_group(ZipStore(path, mode="r"), mode="r")
         ends = np.asarray(group["meta/episode_ends"])
         for rows in map(slice, [0, *ends[:-1]], ends):
             for name in ("point_cloud", "state", "action", "tracks", "object_pose"):

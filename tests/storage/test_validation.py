@@ -11,13 +11,25 @@ import numpy as np
 import pytest
 import zarr
 from conftest import Cli
-from synthetic import call_cli, make_dataset, make_episode, make_receipt, with_quality, with_tracks
+from synthetic import (
+    as_folders,
+    call_cli,
+    edit_json,
+    make_dataset,
+    make_episode,
+    make_receipt,
+    unzipped,
+    with_quality,
+    with_tracks,
+)
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from flowlab.errors import DataError
 from flowlab.records import Episode, PositionSource
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.receipts import Reject, keep_receipt, read_receipts
 from flowlab.storage.shard import Shard, episode_digest, write_shard
+from flowlab.storage.stats import summarize
 from flowlab.storage.validation import validate
 
 UNIT = "drawer-open-000000-000001"
@@ -28,10 +40,10 @@ PER_EPISODE = ("accepted", "frames", "digests")
 OFF_SURFACE = "visible points lie off the surface; the labels do not fit the cloud"
 
 
-def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    values = json.loads(path.read_text())
-    change(values)
-    path.write_text(json.dumps(values))
+def put_shard(folder: Path, episodes: list[Episode], settings_digest: str) -> None:
+    zipped = folder.with_name(f"{folder.name}.zip")
+    write_shard(zipped, episodes, settings_digest)
+    unzipped(zipped)
 
 
 def relabel(change: Callable[[Episode], Episode], receipt_too: bool = True) -> Callable[[Path], None]:
@@ -41,10 +53,11 @@ def relabel(change: Callable[[Episode], Episode], receipt_too: bool = True) -> C
         shard = Shard(dataset / SHARD)
         first, second = shard.episodes()
         second = change(second)
-        write_shard(dataset / SHARD, [first, second], shard.attributes["settings_digest"])
+        shutil.rmtree(dataset / SHARD)
+        put_shard(dataset / SHARD, [first, second], shard.attributes.settings_digest)
         if receipt_too:
             digests = [episode_digest(first), episode_digest(second)]
-            edit_json(dataset / RECEIPT, lambda r: r.update(digests=digests))
+            edit_json(dataset / RECEIPT, lambda r: r.update(digests=digests, stats=summarize([first, second])))
 
     return harm
 
@@ -55,7 +68,8 @@ def rewrite(array: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[
     def harm(dataset: Path) -> None:
         group = zarr.open_group(dataset / SHARD, mode="r+")
         values = change(np.asarray(group[array]))
-        group.create_array(array, data=values, chunks=values.shape, overwrite=True)
+        codecs = [ZstdCodec(level=3), Crc32cCodec()]
+        group.create_array(array, data=values, chunks=values.shape, compressors=codecs, overwrite=True)
 
     return harm
 
@@ -73,9 +87,9 @@ def flip_byte(path: Path) -> None:
 def copy_unit(dataset: Path) -> None:
     """The second episode again, in a unit of its own."""
     source, name = Shard(dataset / SHARD), "drawer-open-000007"
-    write_shard(dataset / f"shards/{name}.zarr", [source.episode(1)], source.attributes["settings_digest"])
-    copy = shutil.copy(dataset / RECEIPT, dataset / f"receipts/{name}.json")
-    edit_json(Path(copy), lambda r: r.update(unit=name, seeds=[1], **{k: r[k][1:] for k in PER_EPISODE}))
+    put_shard(dataset / f"shards/{name}.zarr", [source.episode(1)], source.attributes.settings_digest)
+    copy, stats = shutil.copy(dataset / RECEIPT, dataset / f"receipts/{name}.json"), summarize([source.episode(1)])
+    edit_json(Path(copy), lambda r: r.update(unit=name, seeds=[1], stats=stats, **{k: r[k][1:] for k in PER_EPISODE}))
 
 
 def moved(meters: tuple[float, float, float]) -> Callable[[Episode], Episode]:
@@ -129,11 +143,13 @@ HARMS = {
     "byte flipped": Harm(on_file(f"{SHARD}/data/action/c/0/0", flip_byte), f"{SHARD}/data/action", "damaged"),
     "array missing": Harm(on_file(f"{SHARD}/meta/query_role", shutil.rmtree), f"{SHARD}/meta/query_role", "is missing"),
     "ends missing": Harm(on_file(ENDS, shutil.rmtree), ENDS, "is missing"),
-    "metadata broken": Harm(on_file(f"{TRACKS}/zarr.json", lambda f: f.write_text("{")), TRACKS, "damaged"),
+    "metadata broken": Harm(on_file(f"{TRACKS}/zarr.json", lambda f: f.write_text("{")), TRACKS, "not valid JSON"),
     "optional metadata broken": Harm(
-        on_file(f"{SHARD}/data/object_pose/zarr.json", lambda f: f.write_text("{")), SHARD, "object_pose: damaged"
+        on_file(f"{SHARD}/data/object_pose/zarr.json", lambda f: f.write_text("{")),
+        SHARD,
+        "object_pose/zarr.json: not valid JSON",
     ),
-    "group broken": Harm(on_file(f"{SHARD}/zarr.json", lambda f: f.write_text("{")), SHARD, "not a readable zarr"),
+    "group broken": Harm(on_file(f"{SHARD}/zarr.json", lambda f: f.write_text("{")), SHARD, "not valid JSON"),
     "group of something else": Harm(
         on_file(f"{SHARD}/zarr.json", lambda f: edit_json(f, lambda g: g.update(attributes={}))), SHARD, ""
     ),
@@ -189,12 +205,13 @@ HARMS = {
 def one_unit(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small dataset, as if only its first unit had been asked for: quick to check."""
     data = tmp_path_factory.mktemp("unit") / "d"
-    shutil.copytree(small_dataset / SHARD, data / SHARD)
-    (data / "receipts").mkdir()
+    (data / "receipts").mkdir(parents=True)
+    (data / "shards").mkdir()
+    shutil.copy(small_dataset / f"{SHARD}.zip", data / f"{SHARD}.zip")
     shutil.copy(small_dataset / RECEIPT, data / RECEIPT)
     shutil.copy(small_dataset / "flowlab.json", data)
     edit_json(data / "flowlab.json", lambda m: m.update(requested={"drawer-open": 2}))
-    return data
+    return as_folders(data)
 
 
 @pytest.mark.parametrize("name", HARMS)
@@ -224,7 +241,9 @@ def test_half_a_dataset_is_not_sound(small_dataset: Path, tmp_path: Path, flowla
     assert (str(data / "flowlab.json"), f"push-back: 0 of 3 episodes; {again} for the rest") in findings
     orphans = {str(p) for p in (data / "shards").glob("push-back-*")}
     assert {place for place, problem in findings if "has no receipt" in problem} == orphans
-    assert len(findings) == 1 + len(orphans)
+    other = {place for place, problem in findings if "does not say what the receipts say" in problem}
+    assert other == {str(data / name) for name in ("stats.json", "rejects.jsonl", "README.md")}
+    assert len(findings) == 1 + len(orphans) + len(other)
 
 
 def test_ends_beyond_the_data_are_found(one_unit: Path, tmp_path: Path) -> None:
@@ -259,12 +278,16 @@ def test_findings_come_as_one_json_document(one_unit: Path, tmp_path: Path, flow
 
 
 def test_what_it_says_to_do_mends_the_dataset(small_dataset: Path, tmp_path: Path, flowlab: Cli) -> None:
-    """Delete the receipt, give the extract command again: the same dataset as before."""
+    """The extract command again, with --repair: the same dataset as before."""
     data = shutil.copytree(small_dataset, tmp_path / "d")
-    flip_byte(data / SHARD / "data/action/c/0/0")
-    (data / RECEIPT).unlink()
-    result = flowlab("extract-sim", "drawer-open", "push-back", "--episodes", 3, "--out", data, "--workers", 1)
+    flip_byte(data / f"{SHARD}.zip")
+    again = ("extract-sim", "drawer-open", "push-back", "--episodes", 3, "--out", data, "--workers", 1)
+    (finding,) = validate(data)
+    assert finding.place == str(data / f"{SHARD}.zip")
+    assert "with --repair" in finding.problem
+    result = flowlab(*again, "--repair")
     assert result.returncode == 0, result.stderr
+    assert f"{SHARD}.zip: damaged (its content does not match" in result.stderr
     assert list(validate(data)) == []
     assert Dataset(data).fingerprint == Dataset(small_dataset).fingerprint
 
@@ -369,15 +392,17 @@ def test_estimated_tracks_may_be_wrong_if_they_say_so(name: str, tmp_path: Path)
 
 def test_a_kept_reject_must_be_there_and_no_other(tmp_path: Path) -> None:
     data = make_dataset(tmp_path, [[make_episode(0)]])
+    (tmp_path / "README.md").unlink()  # which would say less than the receipts do now
+    edit_json(tmp_path / "flowlab.json", lambda m: m.update(schema_version=1))
     reject = Reject(task="roll", seed=1, stage="quality", reason="poor", position=0)
     nothing = {"accepted": (), "frames": (), "digests": (), "stats": {}}
     keep_receipt(tmp_path, make_receipt([make_episode(1)], unit="roll-000001", rejects=(reject,), **nothing))
     (finding,) = validate(tmp_path)
     assert finding.place == f"{tmp_path}/rejects/roll-000001.zarr"
-    assert "receipts/roll-000001.json keeps a rejected episode there" in finding.problem
-    write_shard(tmp_path / "rejects/roll-000001.zarr", [make_episode(1)], data.manifest.settings_digest)
+    assert "receipts/roll-000001.json counts it" in finding.problem
+    put_shard(tmp_path / "rejects/roll-000001.zarr", [make_episode(1)], data.manifest.settings_digest)
     assert list(validate(tmp_path)) == []
-    write_shard(tmp_path / "rejects/roll-000002.zarr", [make_episode(2)], data.manifest.settings_digest)
+    put_shard(tmp_path / "rejects/roll-000002.zarr", [make_episode(2)], data.manifest.settings_digest)
     (finding,) = validate(tmp_path)
     assert finding.place == f"{tmp_path}/rejects/roll-000002.zarr"
 
@@ -387,6 +412,7 @@ def test_a_receipt_with_a_name_that_leads_elsewhere_is_refused(name: str, tmp_pa
     make_dataset(tmp_path / "data", [[make_episode(0)]])
     (file,) = (tmp_path / "data" / "receipts").glob("*.json")
     values = json.loads(file.read_text())
+    del values["sha256"]
     file.write_text(json.dumps({**values, "unit": name}))
     with pytest.raises(DataError, match="is no plain name"):
         read_receipts(tmp_path / "data")

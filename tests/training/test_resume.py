@@ -306,7 +306,7 @@ def test_where_the_dataset_is_may_be_changed(tmp_path: Path, capsys: Capture) ->
     plan.write_text(plan.read_text().replace('"steps": 20', '"steps": 21'))
     code, out, err = call_cli(capsys, "train", run, "--resume")
     assert (code, out) == (3, "")
-    assert err.startswith(f"flowlab: {plan}: damaged or changed by hand (its digest is another than its content's); ")
+    assert err.startswith(f"flowlab: {plan}: damaged or changed by hand (its content does not match its checksum); ")
 
 
 def cut(path: Path) -> None:
