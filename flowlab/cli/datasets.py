@@ -103,9 +103,7 @@ def _reservation(folder: Path) -> str:
         return ""
     from flowlab.evaluation.validation import has_checksums
 
-    return (
-        "" if has_checksums(folder) else "; of an earlier version, without checksums, so a changed number is not found"
-    )
+    return "" if has_checksums(folder) else "; of an earlier version, without checksums: a changed number is not found"
 
 
 @click.command()

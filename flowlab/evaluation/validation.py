@@ -10,12 +10,12 @@ from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
-from flowlab.policies.base import make_policy
 from flowlab.policies.checkpoint import (
     CHECKPOINTS,
     POLICY,
     RESUME,
     RUN,
+    build_policy,
     has_begun,
     load_policy,
     read_resume,
@@ -83,12 +83,8 @@ def _check_resume(path: Path) -> None:
     if not (path / RESUME).exists():  # whoever is done with training may delete it
         return
     step, groups = read_resume(path)
-    policy = make_policy(read_trained(path).policy)
-    try:
-        for name in ("policy", "average"):
-            policy.load_state_dict(groups[name])
-    except (KeyError, RuntimeError) as error:
-        raise DataError(f"{path / RESUME}: does not fit {path / POLICY}; restore both from one run") from error
+    for name in ("policy", "average"):
+        build_policy(read_trained(path).policy, groups.get(name, {}), f"{path / RESUME}: does not fit {path / POLICY}")
     for tensors in groups.values():
         _check_finite(path / RESUME, tensors)
     if step > read_run_config(path).steps:

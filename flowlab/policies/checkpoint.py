@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -121,12 +121,26 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
     tensors, step = _read(weights, folder, _ADVICE)
+    policy = build_policy(trained.policy, tensors, f"{weights}: does not fit {folder / POLICY}")
+    return LoadedPolicy(policy.requires_grad_(False).eval().to(device), trained, step, weights)
+
+
+def build_policy(spec: PolicySpec, tensors: Mapping[str, Tensor], misfit: str) -> PolicyNetwork:
+    """The policy of a spec with these weights. Raises :class:`DataError`, with ``misfit``, where they do not fit it.
+
+    That is told by their shapes before memory is taken for a network that may be of any size.
+    """
     try:
-        policy = make_policy(trained.policy).requires_grad_(False).eval()
+        with suppress(NotImplementedError, TypeError), torch.device("meta"):  # some networks need real numbers
+            if {n: v.shape for n, v in make_policy(spec).state_dict().items()} != {
+                n: v.shape for n, v in tensors.items()
+            }:
+                raise DataError(f"{misfit}; restore both from one run")
+        policy = make_policy(spec)
         policy.load_state_dict(tensors)
     except RuntimeError as error:
-        raise DataError(f"{weights}: does not fit {folder / POLICY}; restore both from one run") from error
-    return LoadedPolicy(policy.to(device), trained, step, weights)
+        raise DataError(f"{misfit}; restore both from one run") from error
+    return policy
 
 
 def newest_checkpoint(run: Path) -> Path:

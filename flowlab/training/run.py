@@ -21,9 +21,11 @@ from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (
+    POLICY,
     RUN,
     RunConfig,
     TrainedPolicy,
+    build_policy,
     check_observer,
     has_begun,
     load_policy,
@@ -185,7 +187,10 @@ def resume_run(
         )
     step, groups = read_resume(folder)
     buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
-    trainer = Trainer(folder, config, make_policy(trained.policy), buffer, processes)
+    policy = build_policy(
+        trained.policy, groups.get("policy", {}), f"{folder}: its resume file does not fit its {POLICY}"
+    )
+    trainer = Trainer(folder, config, policy, buffer, processes)
     trainer.load_state(step, groups)
     return trainer
 

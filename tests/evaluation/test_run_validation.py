@@ -126,3 +126,17 @@ def test_of_a_run_without_digests_that_is_said(run: Path, tmp_path: Path, capsys
     assert call_cli(capsys, "validate", work) == (
         0, f"{work}: sound; of an earlier version, without checksums: a changed number is not found\n", ""
     )  # fmt: skip
+
+
+def test_a_network_of_any_size_takes_no_memory(run: Path, tmp_path: Path, capsys: Capture) -> None:
+    """One that was never trained, of 80 GB; its weights are small."""
+    work = Path(shutil.copytree(run, tmp_path / "run"))
+    policy = json.loads((work / "policy.json").read_text())["policy"]
+    policy["settings"]["encoder"]["widths"] = [100_000, 100_000]
+    rewrite(work / "policy.json", policy=policy)
+    for path in work.rglob("*.safetensors"):
+        save_file(load_file(path), path, {"step": str(int(path.stem[5:] if "step" in path.stem else 20))})
+    for command in (("validate", work), ("train", work, "--resume"), ("eval", work, "--offline")):
+        code, out, err = call_cli(capsys, *command)
+        assert code == 3
+        assert "policy.json; restore both from one run" in out + err

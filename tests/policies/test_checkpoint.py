@@ -177,7 +177,8 @@ def test_weights_of_another_shape_are_refused(run: Path, tmp_path: Path, capsys:
         load_policy(tmp_path / "run")
     code, out, err = call_cli(capsys, "train", tmp_path / "run", "--resume")
     assert (code, out) == (3, "")
-    assert err == f"flowlab: {tmp_path / 'run'}: its resume file does not fit its policy.json; start anew\n"
+    sentence = "its resume file does not fit its policy.json; restore both from one run"
+    assert err == f"flowlab: {tmp_path / 'run'}: {sentence}\n"
 
 
 def rewrite(path: Path, values: dict[str, Any]) -> None:
