@@ -3,7 +3,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do command 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
-.PHONY: demo test test-all lint format house docs wheel benchmark clean help
+.PHONY: demo test test-all campaigns lint format house docs wheel benchmark clean help
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -17,6 +17,12 @@ test: .venv/test ## the tests, below 8 minutes on 2 cores
 
 test-all: .venv/test ## the tests, and the slow ones: all 50 tasks, other tools' readers
 	FLOWLAB_TESTS=all $(BIN)/pytest -n 2 --dist loadfile
+
+CAMPAIGN ?= --budget 1200
+campaigns: .venv/test ## kill, flip, fuzz, attack, disk: hours; see docs/reliability.md. CAMPAIGN="--seed 7 --count 50"
+	@failed=; for name in kill flip fuzz attack disk; do \
+	  $(BIN)/python -m tests.campaigns.$$name $(CAMPAIGN) || failed="$$failed $$name"; done; \
+	test -z "$$failed" || { echo "findings in:$$failed; see campaigns/"; exit 1; }
 
 lint: .venv/lint ## format, style, types, import contracts, spelling
 	$(BIN)/ruff format --check

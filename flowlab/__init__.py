@@ -1,9 +1,14 @@
 """flowlab: 3D-flow datasets from robot demonstrations, and policies trained on them."""
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from flowlab.version import __version__
+
+# Else Numba would take from a .numba_config.yaml in the current folder where compiled code is, which it unpickles.
+os.environ.setdefault("NUMBA_CACHE_DIR", "")
+os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", "")
 
 if TYPE_CHECKING:
     from flowlab import data

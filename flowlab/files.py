@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import socket
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -83,6 +84,26 @@ def new_file(path: Path) -> Iterator[Path]:
         sync_folder(path.parent)
     finally:
         _remove(temporary)
+
+
+def scratch_folder() -> "tempfile.TemporaryDirectory[str]":
+    """A folder of this process among the system's temporary ones; those of flowlab that a kill left there go first."""
+    remove_leftovers(Path(tempfile.gettempdir()))
+    return tempfile.TemporaryDirectory(prefix=f"{_prefix()}{os.getpid()}+flowlab-")
+
+
+@contextmanager
+def output_file(path: Path) -> Iterator[Path]:
+    """:func:`new_file` where a user asked for it, in a folder that need not exist; leftovers beside it are deleted.
+
+    Raises:
+        DataError: It cannot be written.
+    """
+    with told_when_unwritable(path, "choose another file or make room"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
+        with new_file(path) as temporary:
+            yield temporary
 
 
 @contextmanager

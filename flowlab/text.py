@@ -1,5 +1,6 @@
 """Small things about text that many rooms need."""
 
+import hashlib
 import re
 import reprlib
 
@@ -7,6 +8,7 @@ from flowlab.limits import MAX_SHOWN
 
 _UNPRINTABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 """Controls, terminal escapes, turns of the writing direction and halves of characters; not the end of a line."""
+_MARKUP = re.compile(r"[\\`*_\[\]<>|&~$#!]")
 _LONGEST_NAME = 150
 """Bytes; file systems take 255, and a file in the making has a longer name."""
 
@@ -19,6 +21,24 @@ def natural_key(text: str) -> list[str | int]:
 def printable(text: str) -> str:
     """Text from a file, fit for a terminal: what could move the cursor or cannot be printed is escaped."""
     return _UNPRINTABLE.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def one_line(text: str) -> str:
+    """Text from a file as a line of a terminal, a page or a figure: no end of a line in it makes another."""
+    return printable(text).replace("\n", " ")
+
+
+def markdown(text: str) -> str:
+    """Text from a file as Markdown shows it, in a table too: none of it is markup."""
+    return _MARKUP.sub(r"\\\g<0>", one_line(text))
+
+
+def file_name(text: str) -> str:
+    """A name for a file that tells what is in it: the text itself where that is a plain name, else one like it."""
+    if is_plain_name(text):
+        return text
+    like = re.sub(r"[^\w.-]+", "-", text, flags=re.ASCII).strip("-.")[: _LONGEST_NAME // 2]
+    return f"{like}-{hashlib.sha256(text.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}".lstrip("-")
 
 
 def shown(value: object, limit: int = MAX_SHOWN) -> str:
@@ -41,5 +61,5 @@ def cut(text: str, limit: int = MAX_SHOWN) -> str:
 
 def is_plain_name(name: str) -> bool:
     """Whether text can name a file in a folder, and nothing outside of it."""
-    fits = 0 < len(name.encode("utf-8", "surrogateescape")) <= _LONGEST_NAME
+    fits = 0 < len(name.encode("utf-8", "surrogatepass")) <= _LONGEST_NAME
     return fits and not name.startswith(".") and not _UNPRINTABLE.search(name) and not re.search(r"[/\\\n]", name)

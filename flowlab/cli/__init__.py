@@ -1,12 +1,15 @@
 """The command line. Commands are imported when they are called, so that help is instant."""
 
 import importlib
+import io
+import os
 import sys
 from typing import Any
 
 import click
 
-from flowlab.errors import FlowlabError
+from flowlab.errors import FlowlabError, UsageError
+from flowlab.text import printable
 from flowlab.version import __version__
 
 _COMMANDS = {
@@ -64,14 +67,28 @@ def cli() -> None:
     """3D-flow datasets from robot demonstrations, and policies trained on them."""
 
 
+def _check_folder() -> None:
+    """Libraries take settings from such files wherever one works, and with them code to run or a picture's look."""
+    for name in ("matplotlibrc", ".numba_config.yaml"):
+        if os.path.lexists(name):
+            raise UsageError(f"{name}: libraries would take settings from it; delete it or work in another folder")
+
+
 def main(*args: Any) -> None:
     """Run the command line; every foreseen error is one sentence and an exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show is escaped
+    os.environ["PYTHONSAFEPATH"] = "1"  # of Pythons that libraries start: nothing of the current folder is imported
     try:
+        _check_folder()
         cli.main(list(args) or None, prog_name="flowlab", standalone_mode=False)
     except click.exceptions.Exit as end:
         sys.exit(end.exit_code)
     except click.ClickException as error:
-        error.show()
+        text = io.StringIO()
+        error.show(text)
+        click.echo(printable(text.getvalue()), err=True, nl=False)
         sys.exit(error.exit_code)
     except FlowlabError as error:
         click.echo(f"flowlab: {error}", err=True)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import console, print_json, print_tables
+from flowlab.cli.console import echo, print_json, print_tables, say
 from flowlab.cli.evaluate import echo_report, parse_seeds
 from flowlab.errors import UsageError
 
@@ -75,8 +75,8 @@ def bench(
     if dry_run:
         units = plan_units(asked)
         for unit in units:
-            click.echo(unit.name)
-        click.echo(plan_cost(asked, len(units), workers))
+            echo(unit.name)
+        echo(plan_cost(asked, len(units), workers))
         return
     progress = None if as_json else _print_progress
     results = run_experiment(asked, out, engine=engine, workers=workers, on_progress=progress)
@@ -93,8 +93,8 @@ def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> N
     """Say how new results went, and how many are there."""
     for r in fresh:
         solved = sum(o.success for o in r.final)
-        console.print(f"{r.name}: {solved} of {len(r.final)} solved", highlight=False)
-    console.print(f"{done} of {total} policies done", highlight=False)
+        say(f"{r.name}: {solved} of {len(r.final)} solved")
+    say(f"{done} of {total} policies done")
 
 
 def _names(text: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""What the commands print."""
+"""What the commands print: text from files is never markup, nor an escape of the terminal, nor a further line."""
 
 import json
 import time
@@ -10,27 +10,43 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from flowlab.text import one_line
+
 if TYPE_CHECKING:
     from flowlab.pipeline.scheduling import ExtractionProgress
     from flowlab.report.tables import Table as ReportTable
     from flowlab.training.trainer import TrainingProgress
 
-console = Console(stderr=True)
-"""For people: progress and logs. Results go to standard output."""
+_PLAIN: Any = {"markup": False, "emoji": False, "highlight": False}
+_console = Console(stderr=True, **_PLAIN)
 _SECONDS_BETWEEN_LINES = 10.0
+
+
+def echo(*lines: str) -> None:
+    """Results: lines on standard output."""
+    for line in lines:
+        click.echo(one_line(line))
+
+
+def say(line: str) -> None:
+    """For people: a line of progress, on standard error."""
+    _console.print(one_line(line), soft_wrap=True)
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str | None = None) -> None:
     """A table on standard output; numbers align right."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title and one_line(title), title_justify="left")
     for k, name in enumerate(columns):
         numeric = all(isinstance(row[k], int | float) for row in rows)
-        table.add_column(name, justify="right" if numeric else "left")
+        table.add_column(one_line(name), justify="right" if numeric else "left")
     for row in rows:
         table.add_row(
-            *(f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else str(v) for v in row)
+            *(
+                f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else one_line(str(v))
+                for v in row
+            )
         )
-    Console().print(table)
+    Console(**_PLAIN).print(table)
 
 
 def print_tables(tables: Sequence["ReportTable"]) -> None:
@@ -55,16 +71,16 @@ class ProgressBar:
     def __init__(self, quiet: bool, line: str = EPISODES_LINE) -> None:
         self._quiet, self._line = quiet, line
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
-            console=console,
+            TextColumn("{task.fields[note]}", markup=False),
+            console=_console,
             speed_estimate_period=300,
-            disable=quiet or not console.is_terminal,
+            disable=quiet or not _console.is_terminal,
         )
         self._task = self._bar.add_task("starting", total=None, note="")
         self._start = self._last_line = time.monotonic()
@@ -79,16 +95,17 @@ class ProgressBar:
 
     def update(self, done: int, total: int, what: str, note: str = "") -> None:
         """Show that ``done`` of ``total`` are there, and what else there is to say of them."""
+        what, note = one_line(what), one_line(note)
         self._bar.update(self._task, completed=done, total=total, description=what, note=note)
         now = time.monotonic()
         if self._done_at_start is None:
             self._done_at_start = done
         due = now - self._last_line > _SECONDS_BETWEEN_LINES or done == total
-        if not self._quiet and not console.is_terminal and due:
+        if not self._quiet and not _console.is_terminal and due:
             fresh, spent = done - self._done_at_start, now - self._start
             left = f", {spent / fresh * (total - done):.0f} s left" if fresh else ""
             values = {"what": what, "done": done, "total": total, "spent": spent, "left": left, "note": note}
-            console.print(self._line.format(**values), highlight=False)
+            say(self._line.format(**values))
             self._last_line = now
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table
 from flowlab.errors import DataError
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def info(dataset: Path, as_json: bool) -> None:
         )
         return
     for name, value in about.items():
-        click.echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
+        echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
     print_table(["task", "episodes", "asked for", "frames", "rejected"], [list(t.values()) for t in tasks])
     columns = ["array", "dimensions", "shape of the first shard", "type", "unit"]
     print_table(columns, [list(a.values()) for a in arrays])
@@ -77,13 +77,13 @@ def validate(folder: Path, as_json: bool) -> None:
     for finding in _findings_of(folder):
         findings.append(finding)
         if not as_json:
-            click.echo(str(finding))
+            echo(str(finding))
     if as_json:
         print_json([{"file": f.place, "problem": f.problem} for f in findings])
     if findings:
         raise DataError(f"{folder}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
     if not as_json:
-        click.echo(f"{folder}: sound{_reservation(folder)}")
+        echo(f"{folder}: sound{_reservation(folder)}")
 
 
 def _findings_of(folder: Path) -> "Iterator[Finding]":
@@ -122,4 +122,4 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     from flowlab.storage.exporters.base import make_exporter
 
     count = make_exporter(exporter, settings).export(Dataset(dataset), out, task)
-    click.echo(f"{count} episodes written to {out} for {exporter}")
+    echo(f"{count} episodes written to {out} for {exporter}")

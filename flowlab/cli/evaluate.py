@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from flowlab.cli.console import ProgressBar, print_json, print_tables
+from flowlab.cli.console import ProgressBar, echo, print_json, print_tables
 from flowlab.errors import UsageError
 
 
@@ -94,7 +94,7 @@ def evaluate(
 
     print_tables(summary_tables(summary))
     for path in videos:
-        click.echo(f"film: {path}")
+        echo(f"film: {path}")
     if out is not None:
         echo_report(out)
 
@@ -128,4 +128,4 @@ def parse_seeds(text: str) -> list[int]:
 
 def echo_report(folder: Path) -> None:
     """Say where a report is."""
-    click.echo(f"{folder / 'report.html'}, with report.json, report.csv and episodes.csv beside it")
+    echo(f"{folder / 'report.html'}, with report.json, report.csv and episodes.csv beside it")

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, print_json, show_extraction
+from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
 
 
 @click.command("extract-sim")
@@ -80,4 +80,4 @@ def _dry_run(tasks: Sequence[str], out: Path, as_json: bool, **options: Any) -> 
         print_json(plan)
         return
     for name, value in plan.items():
-        click.echo(f"{name.replace('_', ' '):<24} {value}")
+        echo(f"{name.replace('_', ' '):<24} {value}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 from pydantic import ValidationError
 
-from flowlab.cli.console import console, print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table, say
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
@@ -61,10 +61,6 @@ def grade(
     from flowlab.grading.run import grade as run_grading
     from flowlab.viz.grade_figure import draw_grades
 
-    def say(text: str) -> None:
-        if not as_json:
-            console.print(text, highlight=False, soft_wrap=True)
-
     report = run_grading(
         recordings,
         out,
@@ -77,7 +73,7 @@ def grade(
         settings=changes,
         weights=weights,
         chunks=_chunk_settings(chunk, stride),
-        on_progress=say,
+        on_progress=lambda text: None if as_json else say(text),
     )
     picture = out / "grade.png"
     draw_grades({t.name: t.mean for t in report.trackers}, picture, title="error of tracks", about=report.about)
@@ -85,7 +81,7 @@ def grade(
         print_json(report.to_json())
         return
     _print(report.trackers)
-    click.echo(f"{out / REPORT} and {picture}")
+    echo(f"{out / REPORT} and {picture}")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -125,7 +121,7 @@ def _print(results: Sequence["TrackerGrade"]) -> None:
     left_out = {row.recording: row.unusable_queries for row in results[0].rows if row.unusable_queries}
     if left_out:
         each = ", ".join(f"{name} {n}" for name, n in left_out.items())
-        click.echo(f"not graded, because the sensor's first depth there is not that of the surface: {each} queries")
+        echo(f"not graded, because the sensor's first depth there is not that of the surface: {each} queries")
 
 
 def _error_figures(errors: "TrackErrors") -> list[object]:

@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import click
 
-from flowlab.cli.console import print_json
+from flowlab.cli.console import echo, print_json
 from flowlab.registry import REGISTRIES, registry_of
 
 
@@ -33,7 +33,7 @@ def plugins(families: tuple[str, ...], check: bool, as_json: bool) -> None:
     width = max((len(row["name"]) for row in rows), default=0)
     for k, row in enumerate(rows):
         if k == 0 or row["family"] != rows[k - 1]["family"]:
-            click.echo(f"{row['family']}:")
-        click.echo(f"  {row['name']:<{width}}  {row['place']}  ({row['package']})")
+            echo(f"{row['family']}:")
+        echo(f"  {row['name']:<{width}}  {row['place']}  ({row['package']})")
     for problem in dict.fromkeys(row["problem"] for row in rows if row["problem"]):
-        click.echo(problem)
+        echo(problem)

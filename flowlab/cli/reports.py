@@ -3,9 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
-import click
-
-from flowlab.cli.console import console, print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table, say
 from flowlab.pipeline.units import JobShard
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.overview import frame_count, left_out_frames, stage_totals, task_totals
@@ -42,7 +40,7 @@ def finish_extraction(dataset: Dataset, seconds: float, share: JobShard, as_json
         return
     print_extraction(report)
     if dataset.missing and share.count > 1:
-        console.print("the rest belongs to the other shards", highlight=False)
+        say("the rest belongs to the other shards")
 
 
 def print_quality(about: dict[str, Any]) -> None:
@@ -51,7 +49,7 @@ def print_quality(about: dict[str, Any]) -> None:
         return
     quality, seen = about["quality"], about["quality"]["visible_sigma_m"]
     shares = ", ".join(f"{share:.0%} {source}" for source, share in quality["source_share"].items())
-    click.echo(
+    echo(
         f"stated error of visible points: median {seen['p50'] * 1e3:.2g} mm, 90 % below {seen['p90'] * 1e3:.2g} mm; "
         f"{quality['visible_share']:.0%} of all positions visible; {shares}"
     )
@@ -63,15 +61,15 @@ def print_extraction(report: dict[str, Any]) -> None:
     print_table(["stage", "calls", "CPU s", "ms/frame", "rejects"], [list(s.values()) for s in report["stages"]])
     print_quality(report)
     for bad in report.get("bad_frames", ())[:_SHOWN]:
-        click.echo(f"left out of {bad['recording']}: {bad['frame']} {bad['reason']}")
+        echo(f"left out of {bad['recording']}: {bad['frame']} {bad['reason']}")
     if len(report.get("bad_frames", ())) > _SHOWN:
-        click.echo(f"... and {len(report['bad_frames']) - _SHOWN} bad frames more; --json lists all")
+        echo(f"... and {len(report['bad_frames']) - _SHOWN} bad frames more; --json lists all")
     for reject in report["rejects"][:_SHOWN]:
         who = reject.get("source") or f"{reject['task']} seed {reject['seed']}"
-        click.echo(f"rejected {who} at {reject['stage']}: {reject['reason']}")
+        echo(f"rejected {who} at {reject['stage']}: {reject['reason']}")
     if len(report["rejects"]) > _SHOWN:
-        click.echo(f"... and {len(report['rejects']) - _SHOWN} more, all in {report['dataset']}/rejects.jsonl")
-    click.echo(
+        echo(f"... and {len(report['rejects']) - _SHOWN} more, all in {report['dataset']}/rejects.jsonl")
+    echo(
         f"{report['episodes']} episodes, {report['frames']} frames in {report['dataset']} "
         f"({report['wall_s']:.1f} s). Next: flowlab validate {report['dataset']}"
     )

@@ -2,7 +2,7 @@
 
 import click
 
-from flowlab.cli.console import print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table
 from flowlab.sim.tasks import GROUPS, TASKS, select_tasks
 
 
@@ -17,4 +17,4 @@ def tasks(group: str, as_json: bool) -> None:
         return
     print_table(["task", "difficulty", "expert"], [[t.name, t.difficulty, t.expert] for t in chosen])
     counts = ", ".join(f"{len(names)} {group}" for group, names in GROUPS.items() if group != "all")
-    click.echo(f"groups for --group: {counts}, {len(TASKS)} all")
+    echo(f"groups for --group: {counts}, {len(TASKS)} all")

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, print_json, show_extraction
+from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
 from flowlab.errors import DataError, UsageError
 
 
@@ -93,13 +93,13 @@ def _dry_run(paths: tuple[Path, ...], task: str | None, workers: int | None, as_
     for one in inspect_recordings(chosen, find_jobs(chosen, paths, task)):
         inspected.append(one)
         if not as_json:
-            click.echo("\n".join(lines_of(facts_of(one))))
+            echo(*lines_of(facts_of(one)))
     plan = asdict(estimate_labeling(chosen, inspected, workers))
     if as_json:
         print_json({"recordings": [facts_of(one) for one in inspected]} | plan)
     else:
         for name, value in plan.items():
-            click.echo(f"{name.replace('_', ' '):<18} {value}")
+            echo(f"{name.replace('_', ' '):<18} {value}")
     problems = sum(one.problem is not None for one in inspected)
     if problems:
         raise DataError(f"{problems} of {len(inspected)} recordings cannot be used as they are; see above")

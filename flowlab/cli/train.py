@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import STEPS_LINE, ProgressBar, console, print_json, print_table, show_training
+from flowlab.cli.console import STEPS_LINE, ProgressBar, echo, print_json, print_table, say, show_training
 from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
@@ -96,7 +96,7 @@ def train(
     first = is_first_process()
     quiet = as_json or not first
     with ProgressBar(quiet, STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
-        watch = training.Watch(_silent if quiet else _say, partial(show_training, bar), should_stop)
+        watch = training.Watch(_silent if quiet else say, partial(show_training, bar), should_stop)
         if resume:
             done = training.resume(
                 source, device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
@@ -119,10 +119,6 @@ def _silent(text: str) -> None:
     """Not in JSON, nor in other processes than the first."""
 
 
-def _say(text: str) -> None:
-    console.print(text, highlight=False, soft_wrap=True)
-
-
 def _print(done: "TrainedRun", as_json: bool) -> None:
     """What came out."""
     if as_json:
@@ -133,9 +129,9 @@ def _print(done: "TrainedRun", as_json: bool) -> None:
             ["on held-out demonstrations", "policy", "doing nothing", "going on as before"], _rows(done.validation)
         )
     if done.finished:
-        click.echo(f"{done.folder}: trained for {done.step} steps; the curve is {done.curve}")
+        echo(f"{done.folder}: trained for {done.step} steps; the curve is {done.curve}")
     else:
-        click.echo(f"stopped at step {done.step} of {done.steps}; go on with: flowlab train {done.folder} --resume")
+        echo(f"stopped at step {done.step} of {done.steps}; go on with: flowlab train {done.folder} --resume")
 
 
 def _rows(errors: dict[str, float]) -> list[list[object]]:

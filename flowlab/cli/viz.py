@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from flowlab.cli.console import echo
+
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
@@ -44,19 +46,20 @@ def viz(
     """
     from flowlab.errors import UsageError
     from flowlab.report.episode_view import view_episode
+    from flowlab.text import file_name
 
     if fps is not None and mp4 is None:
         raise UsageError("--fps is about the film; give --mp4 FILE too")
     view = view_episode(source, episode, task=task, seed=seed, rejects=rejects)
     if view.note:
-        click.echo(f"{view.name} was {view.note}")
+        echo(f"{view.name} was {view.note}")
     if png is not None:
         view.write_png(png)
-        click.echo(f"{view.name}: {png}")
+        echo(f"{view.name}: {png}")
     if mp4 is not None:
         view.write_mp4(mp4, fps=fps)
-        click.echo(f"{view.name}: {mp4}")
+        echo(f"{view.name}: {mp4}")
     if save is not None or (png is None and mp4 is None):
-        save = save or Path(f"{view.episode.task}-{view.episode.seed:06d}.rrd")
+        save = save or Path(file_name(f"{view.episode.task}-{view.episode.seed:06d}") + ".rrd")
         view.write_rrd(save)
-        click.echo(f"{view.name}: {save}; open it with: rerun {save}")
+        echo(f"{view.name}: {save}; open it with: rerun {save}")

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from flowlab.benchmark.ordering import disambiguate
 from flowlab.benchmark.summary import Summary
 from flowlab.evaluation.results import EpisodeResult, PolicyResult, RolloutFlowError
+from flowlab.text import one_line
 
 Rows = Iterable[Sequence[object]]
 
@@ -50,9 +51,15 @@ def _episode(o: EpisodeResult) -> tuple[object, ...]:
 
 
 def csv_text(columns: Sequence[str], rows: Rows) -> str:
-    """Columns and rows as CSV."""
+    """Columns and rows as CSV. Text that a spreadsheet would take for a formula has an apostrophe before it."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(rows)
+    writer.writerows([_as_text(value) if isinstance(value, str) else value for value in row] for row in rows)
     return text.getvalue()
+
+
+def _as_text(value: str) -> str:
+    """A cell that is nothing but text: one line, and no formula."""
+    line = one_line(value)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line

@@ -1,14 +1,14 @@
 """One episode to look at: of a dataset, of what was kept out of it, or one that a policy tries now."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowlab.errors import DataError, FlowlabError, UsageError
+from flowlab.errors import DataError, UsageError
 from flowlab.records import Episode, FlowPrediction
 from flowlab.storage.dataset import Dataset, RejectRef
 from flowlab.storage.episodes import EpisodeRef
+from flowlab.text import markdown
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,30 +26,27 @@ class EpisodeView:
 
     def write_png(self, path: Path) -> None:
         """Draw a still: of the predicted flow where there is one, else of the tracks."""
-        with _writing(path):
-            if self.prediction is None:
-                from flowlab.viz.still import draw_still
+        if self.prediction is None:
+            from flowlab.viz.still import draw_still
 
-                draw_still(self.episode, path, title=self.name, note=self.note)
-            else:
-                from flowlab.viz.flow_prediction import draw_flow_prediction
+            draw_still(self.episode, path, title=self.name, note=self.note)
+        else:
+            from flowlab.viz.flow_prediction import draw_flow_prediction
 
-                draw_flow_prediction(self.episode, self.prediction, path, title=self.name)
+            draw_flow_prediction(self.episode, self.prediction, path, title=self.name)
 
     def write_mp4(self, path: Path, *, fps: float | None = None) -> None:
         """Write a video of the pictures with tracks drawn in; ``fps`` is real time by default."""
         from flowlab.viz.video import write_video
 
-        with _writing(path):
-            write_video(self.episode, path, fps=fps, title=self.name, note=self.note, prediction=self.prediction)
+        write_video(self.episode, path, fps=fps, title=self.name, note=self.note, prediction=self.prediction)
 
     def write_rrd(self, path: Path) -> None:
         """Write a Rerun recording."""
         from flowlab.viz.recording import write_rrd
 
         name = f"{self.name} (rejected)" if self.note else self.name
-        with _writing(path):
-            write_rrd(self.episode, path, name=name, about=self.about, prediction=self.prediction)
+        write_rrd(self.episode, path, name=name, about=self.about, prediction=self.prediction)
 
 
 def view_episode(
@@ -84,14 +81,14 @@ def is_run(source: Path) -> bool:
 
 def _view_stored(data: Dataset, episode: int, task: str | None, rejects: bool) -> EpisodeView:
     """An episode of a dataset, or of what was kept out of it."""
-    about = f"dataset {data.path}, fingerprint {data.fingerprint}, recipe {data.manifest.recipe}"
+    about = markdown(f"dataset {data.path}, fingerprint {data.fingerprint}, recipe {data.manifest.recipe}")
     if not rejects:
         shown = data.episode(_position(data, data.refs, "episode", episode, task))
         return EpisodeView(shown, f"{shown.task} seed {shown.seed}", about)
     position = _position(data, data.rejects, "reject", episode, task)
     ref, shown = data.rejects[position], data.rejected(position)
     note = f"rejected at {ref.stage}: {ref.reason}"
-    return EpisodeView(shown, f"{shown.task} seed {shown.seed}", f"**{note}**\n\n{about}", note)
+    return EpisodeView(shown, f"{shown.task} seed {shown.seed}", f"**{markdown(note)}**\n\n{about}", note)
 
 
 def _view_attempt(run: Path, task: str | None, seed: int, episode: int) -> EpisodeView:
@@ -108,7 +105,7 @@ def _view_attempt(run: Path, task: str | None, seed: int, episode: int) -> Episo
     check_unseen([trial], checkpoint.trained.scene_seeds, run)
     shown = replay_episode(checkpoint, trial)
     name = f"{checkpoint.run.name}: {trial.task}, seed {seed}, episode {episode}, {shown.result.ending}"
-    about = f"{checkpoint.weights}, scene seed {trial.scene_seed}"
+    about = markdown(f"{checkpoint.weights}, scene seed {trial.scene_seed}")
     return EpisodeView(shown.episode, name, about, prediction=shown.prediction)
 
 
@@ -119,14 +116,3 @@ def _position(data: Dataset, refs: Sequence[EpisodeRef | RejectRef], kind: str, 
         where = f"{data.path}" if task is None else f"{data.path}, task '{task}'"
         raise DataError(f"{where}: no {kind} {episode}; there are {len(positions)}, counted from 0")
     return positions[episode]
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turns a failure to write a file into a sentence."""
-    try:
-        yield
-    except FlowlabError:  # that a file to be read is missing is an OSError, too
-        raise
-    except OSError as error:
-        raise FlowlabError(f"{path}: cannot be written ({error.strerror}); choose another file") from error

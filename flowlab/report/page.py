@@ -15,6 +15,7 @@ from flowlab.evaluation.results import TrainingRecord
 from flowlab.report.paper_differences import paper_differences
 from flowlab.report.success_rows import episodes_each, success_rows
 from flowlab.report.tables import Table
+from flowlab.text import one_line
 from flowlab.version import __version__
 from flowlab.viz.plot_style import DPI, policy_colors
 
@@ -36,7 +37,9 @@ def render_page(
         videos: Names and relative addresses of videos to link.
         robot_tables: Trials on a robot.
     """
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    environment = Environment(
+        autoescape=True, finalize=_without_controls, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
+    )
     environment.filters |= {"percent": _percent, "p": _p_value, "number": _number, "short": _short}
     template = environment.from_string(files("flowlab.report").joinpath("report.html.j2").read_text("utf-8"))
     return template.render(
@@ -54,6 +57,11 @@ def render_page(
         robot_tables=robot_tables,
         version=__version__,
     )
+
+
+def _without_controls(value: object) -> object:
+    """What is shown of a value; markup of the template's own is no plain text."""
+    return one_line(value) if type(value) is str else value
 
 
 @dataclass(frozen=True, slots=True)

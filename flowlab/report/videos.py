@@ -7,6 +7,7 @@ from flowlab.evaluation.checkpoints import CheckpointRef, find_checkpoint
 from flowlab.evaluation.replay import replay_episode
 from flowlab.evaluation.results import EpisodeResult, PolicyResult
 from flowlab.evaluation.trials import Trial
+from flowlab.text import file_name
 from flowlab.viz.recording import write_rrd
 from flowlab.viz.video import write_video
 
@@ -48,7 +49,7 @@ def write_episode_video(checkpoint: CheckpointRef, trial: Trial, folder: Path) -
     run, result = checkpoint.run.name, shown.result
     title = f"{run}: {trial.task}, seed {trial.seed}, episode {trial.episode}, {result.ending}"
     ending = "solved" if result.success else "failed"
-    path = folder / f"{run}-{trial.task}-seed-{trial.seed}-{trial.episode}-{ending}.mp4"
+    path = folder / f"{file_name(f'{run}-{trial.task}-seed-{trial.seed}-{trial.episode}-{ending}')}.mp4"
     write_video(shown.episode, path, title=title, prediction=shown.prediction)
     write_rrd(shown.episode, path.with_suffix(".rrd"), name=title, prediction=shown.prediction)
     return path

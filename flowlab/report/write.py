@@ -9,11 +9,11 @@ from flowlab.benchmark.robot_trials import RobotTrial
 from flowlab.benchmark.summary import Summary
 from flowlab.errors import DataError
 from flowlab.evaluation.results import PolicyResult
-from flowlab.files import write_atomically, write_json
+from flowlab.files import remove_leftovers, told_when_unwritable, write_atomically, write_json
 from flowlab.report import figures
 from flowlab.report.csv_files import EPISODE_COLUMNS, REPORT_COLUMNS, csv_text, episode_rows, report_rows
 from flowlab.report.page import render_page
-from flowlab.report.tables import robot_trial_tables
+from flowlab.report.tables import Table, robot_trial_tables
 from flowlab.version import __version__
 
 PAGE = "report.html"
@@ -43,12 +43,20 @@ def write_report(
         The page.
 
     Raises:
-        DataError: There are neither results nor such trials.
+        DataError: There are neither results nor such trials, or the folder cannot be written.
     """
     if not results and not robot_trials:
         raise DataError("there is nothing to report; evaluate a policy first, with: flowlab eval RUN")
-    robot_tables = robot_trial_tables(robot_trials)
+    with told_when_unwritable(folder, "choose another folder or make room"):
+        return _write(folder, summary, results, videos, robot_trial_tables(robot_trials))
+
+
+def _write(
+    folder: Path, summary: Summary, results: Sequence[PolicyResult], videos: Sequence[Path], robot_tables: list[Table]
+) -> Path:
+    """Write all of it; what an earlier one that was killed left behind goes."""
     folder.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(folder)
     drawn = figures.draw_figures(folder / figures.FOLDER, summary)
     numbers = summary.to_json()
     values = {

@@ -1,5 +1,6 @@
 """MetaWorld with everything decided by (task, seed)."""
 
+import logging
 from functools import partial
 
 import metaworld
@@ -13,6 +14,9 @@ from flowlab.geometry.transforms import rigid
 from flowlab.sim.scene import Poses, Scene
 from flowlab.sim.scene_settings import SceneSettings
 from flowlab.sim.tasks import find_task
+
+# Else MuJoCo adds its warnings to a MUJOCO_LOG.TXT in the current folder, through whatever link is there.
+mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
 
 
 class Simulation:

@@ -6,11 +6,12 @@ from typing import Any
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA
+from flowlab.text import markdown
 
 _CARD = """---
 tags: [robotics, point-cloud, 3d-flow, flowlab]
 ---
-# 3D-flow dataset `{recipe}`
+# 3D-flow dataset {recipe}
 
 {episodes} episodes, {frames} frames, made by flowlab {version}. World frame: {world_frame}
 
@@ -31,7 +32,7 @@ than 1 cm in their episode; the 95th percentile of a step is {p95:.2g} mm.
 """
 
 _QUALITY = """
-Tracks are estimated from pictures, by the tracker `{tracker}`; every position states its error as `data/sigma`.
+Tracks are estimated from pictures, by the tracker {tracker}; every position states its error as `data/sigma`.
 Of visible points it is {p50:.2g} mm in the median and {p90:.2g} mm at the 90th percentile. {visible:.0%} of all
 positions are visible; {shares}.
 """
@@ -44,11 +45,11 @@ def dataset_card(manifest: Manifest, receipts: Sequence[Receipt], stats: dict[st
         mine = [r for r in receipts if r.task == task]
         frames = sum(sum(r.frames) for r in mine)
         rejected = sum(len(r.rejects) for r in mine)
-        rows.append(f"| {task} | {sum(len(r.accepted) for r in mine)} | {frames} | {rejected} |")
+        rows.append(f"| {markdown(task)} | {sum(len(r.accepted) for r in mine)} | {frames} | {rejected} |")
     return _CARD.format(
-        recipe=manifest.recipe,
-        version=manifest.flowlab,
-        world_frame=manifest.provenance.world_frame,
+        recipe=markdown(manifest.recipe),
+        version=markdown(manifest.flowlab),
+        world_frame=markdown(manifest.provenance.world_frame),
         episodes=stats["episodes"],
         frames=stats["frames"],
         tasks="\n".join(rows),
@@ -65,11 +66,11 @@ def _quality(manifest: Manifest, quality: dict[str, Any]) -> str:
     """What the card says of tracks that were estimated."""
     sigma = quality["visible_sigma_m"]
     return _QUALITY.format(
-        tracker=manifest.provenance.tracker or "unknown",
+        tracker=markdown(manifest.provenance.tracker or "unknown"),
         p50=sigma["p50"] * 1e3,
         p90=sigma["p90"] * 1e3,
         visible=quality["visible_share"],
-        shares=", ".join(f"{share:.0%} are {source}" for source, share in quality["source_share"].items()),
+        shares=", ".join(f"{share:.0%} are {markdown(source)}" for source, share in quality["source_share"].items()),
     )
 
 

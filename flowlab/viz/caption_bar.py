@@ -12,8 +12,10 @@ from matplotlib.text import Text
 from matplotlib.typing import ColorType
 
 from flowlab.records import Episode
+from flowlab.text import cut
 from flowlab.viz.captions import role_name, sigma_summary, tracker_name
 from flowlab.viz.colors import PREDICTED_RGB, SIGMA_LIMIT, role_rgb, sigma_rgb
+from flowlab.viz.plot_style import label_text, plain_style
 
 _DPI = 128
 """A power of two, so that sizes in inches are whole pixels."""
@@ -28,11 +30,12 @@ class CaptionBar:
     """Draws the bar of every step. Along its top runs how far the video is, in the color of that step's
     median stated error where there is one."""
 
+    @plain_style()
     def __init__(self, episode: Episode, width: int, title: str, note: str, *, predicted: bool = False) -> None:
         self._episode = episode
         self._scale = max(1.0, width / _WIDTH)
         self._width = width / self._scale
-        lines = wrap(note, int(self._width / 6.4), max_lines=3, placeholder=" …")
+        lines = wrap(cut(note, 1000), int(self._width / 6.4), max_lines=3, placeholder=" …")
         self._height = _HEIGHT + _NOTE_HEIGHT * len(lines)
         size = width / _DPI, round(self._height * self._scale) / _DPI
         self._figure = Figure(size, dpi=_DPI, facecolor=_BACKGROUND)
@@ -70,7 +73,7 @@ class CaptionBar:
         """Put a line of text in the middle of whose height is y, ``size`` pixels high."""
         place = x / self._width, 1 - y / self._height
         points = size * self._scale * 72 / _DPI
-        return self._figure.text(*place, text, fontsize=points, color=color, va="center", **style)
+        return self._figure.text(*place, label_text(text, 120), fontsize=points, color=color, va="center", **style)
 
     def _draw_marks(self, predicted: bool) -> None:
         """The legend of the marks: disc, ring, cross; and the line of a predicted path."""

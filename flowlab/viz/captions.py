@@ -8,6 +8,7 @@ from jaxtyping import Bool
 
 from flowlab.geometry.moving import MOVING_IN_EPISODE_M
 from flowlab.records import Episode, PositionSource, Role
+from flowlab.text import markdown
 from flowlab.viz.colors import SIGMA_LIMIT
 
 
@@ -68,7 +69,7 @@ def describe(episode: Episode) -> str:
     if "source" in episode.extras:
         rows["recording"] = episode.extras["source"]
     rows |= _describe_quality(episode)
-    lines = [f"| {key} | {value} |" for key, value in rows.items()]
+    lines = [f"| {key} | {markdown(str(value))} |" for key, value in rows.items()]
     return "\n".join([lines[0], "|---|---|", *lines[1:]])
 
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from flowlab.viz.plot_style import policy_colors, save_png, style_axes
+from flowlab.viz.plot_style import plain_style, policy_colors, save_png, style_axes
 from flowlab.viz.row_chart import (
     AXIS_IN,
     HEADING_IN,
@@ -40,6 +40,7 @@ def draw_flow_errors(errors: Mapping[str, Mapping[str, FlowBars]], labels: Seque
     save_png(plot_flow_errors(errors, labels), png)
 
 
+@plain_style()
 def plot_flow_errors(errors: Mapping[str, Mapping[str, FlowBars]], labels: Sequence[str]) -> Figure:
     """Errors of predicted flow: a bar for each policy, before a pale one of predicting no motion on its episodes."""
     colors = {x: c for x, c in policy_colors(labels).items() if any(x in of_task for of_task in errors.values())}

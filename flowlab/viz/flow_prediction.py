@@ -27,7 +27,7 @@ from flowlab.viz.panels import (
     two_panels,
 )
 from flowlab.viz.plan_predictions import PlanPrediction, largest_predicted_motion, plan_predictions
-from flowlab.viz.plot_style import INK, QUIET, save_png, set_heading
+from flowlab.viz.plot_style import INK, QUIET, plain_style, save_png, set_heading
 
 PATHS_PER_ROLE = 30
 """More paths than this hide each other."""
@@ -46,6 +46,7 @@ def draw_flow_prediction(
     save_png(plot_flow_prediction(episode, prediction, title, plan), path)
 
 
+@plain_style()
 def plot_flow_prediction(episode: Episode, prediction: FlowPrediction, title: str, plan: int | None = None) -> Figure:
     """The figure of :func:`draw_flow_prediction`. Its first two axes are the camera's view, in pixels of the camera
     turned upright, and the side view, in meters of the world frame."""

@@ -10,7 +10,17 @@ from matplotlib.lines import Line2D
 
 from flowlab.grading.calibration import Calibration
 from flowlab.grading.metrics import CURVE_MM, TrackMetrics
-from flowlab.viz.plot_style import INK, QUIET, SERIES, new_figure, save_png, set_title, style_axes
+from flowlab.viz.plot_style import (
+    INK,
+    QUIET,
+    SERIES,
+    label_text,
+    new_figure,
+    plain_style,
+    save_png,
+    set_title,
+    style_axes,
+)
 
 GROUPS = {
     "all": "all visible points",
@@ -31,6 +41,7 @@ def draw_grades(metrics: Mapping[str, TrackMetrics], path: Path, *, title: str, 
     save_png(plot_grades(metrics, title, about), path)
 
 
+@plain_style()
 def plot_grades(metrics: Mapping[str, TrackMetrics], title: str, about: str = "") -> Figure:
     """The figure of :func:`draw_grades`: a panel of cumulative error curves for each group there is, then the
     reliability of sigma, if any is stated; a line for each tracker."""
@@ -48,8 +59,10 @@ def plot_grades(metrics: Mapping[str, TrackMetrics], title: str, about: str = ""
     width, height = figure.get_size_inches()
     figure.subplots_adjust(0.6 / width, 0.78 / height, 1 - 0.15 / width, 1 - 0.92 / height, wspace=0.22)
     set_title(figure, title)
-    figure.text(1 - 0.15 / width, 0.2 / height, about, fontsize=9, color=QUIET, va="center", ha="right")
-    lines = [Line2D([], [], color=color, linewidth=2.2, label=name) for name, color in colors.items()]
+    figure.text(
+        1 - 0.15 / width, 0.2 / height, label_text(about, 120), fontsize=9, color=QUIET, va="center", ha="right"
+    )
+    lines = [Line2D([], [], color=color, linewidth=2.2, label=label_text(name)) for name, color in colors.items()]
     figure.legend(
         handles=lines, loc="lower left", bbox_to_anchor=(0.15 / width, 0.08 / height), ncols=len(lines),
         frameon=False, fontsize=9.5, labelcolor=INK, handlelength=1.4, borderpad=0, borderaxespad=0,

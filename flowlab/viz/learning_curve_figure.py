@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from flowlab.viz.plot_style import QUIET, policy_colors, save_png, style_axes
+from flowlab.viz.plot_style import QUIET, plain_style, policy_colors, save_png, style_axes
 from flowlab.viz.row_chart import HEADING_IN, MARGIN_IN, add_axes, line_handles, percent, titled_figure
 from flowlab.viz.success_figure import Mark
 
@@ -30,6 +30,7 @@ def draw_learning_curves(curves: Mapping[str, Mapping[str, LearningCurve]], labe
     save_png(plot_learning_curves(curves, labels), png)
 
 
+@plain_style()
 def plot_learning_curves(curves: Mapping[str, Mapping[str, LearningCurve]], labels: Sequence[str]) -> Figure:
     """Success over CPU minutes of training: a panel for each task, a line with its interval for each policy."""
     colors = {x: c for x, c in policy_colors(labels).items() if any(x in of_task for of_task in curves.values())}

@@ -18,7 +18,7 @@ from flowlab.records import Episode
 from flowlab.viz.captions import role_name
 from flowlab.viz.colors import role_rgb
 from flowlab.viz.orientation import up_from_world, world_is_camera_frame
-from flowlab.viz.plot_style import GRID, INK, LABEL_PT, QUIET, TICK_PT, hide_frame, new_figure
+from flowlab.viz.plot_style import GRID, INK, LABEL_PT, QUIET, TICK_PT, hide_frame, label_text, new_figure
 
 TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#3b1f8f", "#a3218e", "#e2486a", "#f58a3c", "#f7bf3a"])
 """From the first step to the last: distinct from gray and readable on white."""
@@ -31,8 +31,8 @@ _BOXES = {"camera": (LEFT, 0.145, 0.43, 0.70), "side": (0.525, 0.145, 0.40, 0.70
 def two_panels(title: str, caption: str) -> tuple[Figure, Axes, Axes]:
     """A figure with a title, a caption, and room for a camera's view and a side view."""
     figure = new_figure(*_SIZE_IN)
-    figure.text(LEFT, 0.955, title, fontsize=17, weight="bold", color=INK, va="center")
-    figure.text(LEFT, 0.038, caption, fontsize=9.5, color=QUIET, va="center")
+    figure.text(LEFT, 0.955, label_text(title, 120), fontsize=17, weight="bold", color=INK, va="center")
+    figure.text(LEFT, 0.038, label_text(caption, 250), fontsize=9.5, color=QUIET, va="center")
     return figure, figure.add_axes(_BOXES["camera"]), figure.add_axes(_BOXES["side"])
 
 

@@ -1,15 +1,17 @@
 """One look for all figures: colors, axes, headings, and how they are written."""
 
 import colorsys
-import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from flowlab.files import temporary_path
+from flowlab.files import output_file
+from flowlab.text import cut
 
 INK, QUIET, ALARM = "#22262c", "#747b85", "#c2263b"
 """Of text: what is read first, what explains it, what warns."""
@@ -24,8 +26,28 @@ _PAPER_COLORS = {
     "fdp-stratified": PINK, "fdp-auxiliary": "#8a7a5c",
 }  # fmt: skip
 _FURTHER = ("#c2453d", "#2a9aa8", "#6b7a2e", "#a05a2c", "#5b6ee0", "#4a4f57")
+_LONGEST_LABEL = 60
+"""Characters of a name in a figure, which grows with its longest."""
 _GOLDEN = 0.61803398875
 """Hues that are this share of the circle apart never come close soon."""
+
+
+@contextmanager
+def plain_style() -> Iterator[None]:
+    """Matplotlib as it comes, whatever a ``matplotlibrc`` says, and no text is a formula: names are shown as they are.
+
+    Everything that makes or writes a figure is decorated with it.
+    """
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["text.parse_math"] = False
+        yield
+
+
+def label_text(text: str, limit: int = _LONGEST_LABEL) -> str:
+    """Text from a file as a figure shows it: one line, no longer than that."""
+    short = cut(text, limit)
+    return f" {short}" if short.startswith("_") else short  # legends leave out what begins so
 
 
 def policy_colors(labels: Sequence[str]) -> dict[str, str]:
@@ -44,12 +66,13 @@ def new_figure(width: float, height: float) -> Figure:
 def set_title(figure: Figure, text: str, *, size: float = 15.0) -> None:
     """The title in a figure's upper left corner; ``size`` is in points."""
     width, height = figure.get_size_inches()
+    text = label_text(text, 200)
     figure.text(0.15 / width, 1 - 0.32 / height, text, fontsize=size, weight="bold", color=INK, va="center")
 
 
 def set_heading(axes: Axes, text: str) -> None:
     """Say above a panel what it shows."""
-    axes.set_title(text, loc="left", fontsize=HEADING_PT, color=INK, pad=8)
+    axes.set_title(label_text(text), loc="left", fontsize=HEADING_PT, color=INK, pad=8)
 
 
 def style_axes(axes: Axes, heading: str, ylabel: str = "") -> None:
@@ -68,15 +91,11 @@ def hide_frame(axes: Axes) -> None:
         spine.set_visible(False)
 
 
+@plain_style()
 def save_png(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, the same bytes for the same figure. ``path`` is either absent, as before, or whole."""
-    temporary = temporary_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with output_file(path) as temporary:
         figure.savefig(temporary, format="png", facecolor="white", metadata={"Software": None})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _further_colors() -> Iterator[str]:

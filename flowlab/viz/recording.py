@@ -1,6 +1,5 @@
 """An episode as a Rerun recording, with a blueprint that opens well."""
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,10 +8,11 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Bool, UInt8
 
-from flowlab.files import temporary_path
+from flowlab.files import output_file
 from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode, FlowPrediction
+from flowlab.text import one_line
 from flowlab.viz.blueprint import CAMERA, DEPTH, RGB, make_blueprint, scene_size
 from flowlab.viz.captions import describe
 from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
@@ -45,12 +45,11 @@ def write_rrd(
     recording = rr.RecordingStream("flowlab")
     plans = [] if prediction is None else plan_predictions(episode, prediction)
     errors = list(prediction_errors(plans))
-    temporary = temporary_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    stream = recording.binary_stream()  # Rerun's own files are cut off without a word where a disk is full
     try:
         with _strict():
-            recording.save(temporary, default_blueprint=make_blueprint(episode, flow_error=bool(errors)))
-            recording.send_recording_name(name)
+            recording.send_blueprint(make_blueprint(episode, flow_error=bool(errors)), make_active=False)
+            recording.send_recording_name(one_line(name))
             for send in (_send_cloud, _send_tracks, _send_camera, _send_pictures, _send_object, _send_scalars):
                 send(recording, episode)
             if plans:
@@ -59,11 +58,11 @@ def write_rrd(
                 _send_flow_error(recording, episode, errors)
             legend = f"\n\n{_LEGEND}" if plans else ""
             _send_info(recording, f"{about}\n\n{describe(episode)}{legend}")
-            recording.disconnect()  # writes what is buffered, and the footer
-        os.replace(temporary, path)
+            content = stream.read()
     finally:
         recording.disconnect()
-        temporary.unlink(missing_ok=True)
+    with output_file(path) as temporary:
+        temporary.write_bytes(content or b"")
 
 
 @contextmanager

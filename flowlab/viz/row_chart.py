@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowlab.viz.plot_style import INK, new_figure
+from flowlab.viz.plot_style import INK, label_text, new_figure
 
 HEADING_IN, AXIS_IN, MARGIN_IN = 0.42, 0.34, 0.3
 """Room above a panel for its heading, below it for its axis, and beside it [in]."""
@@ -19,7 +19,7 @@ _Drawn = TypeVar("_Drawn")
 
 def width_of(names: Iterable[str]) -> float:
     """Room for the longest name, a gap, and no less than a column of figures looks well with [in]."""
-    return max(_LETTER_IN * max(map(len, names)) + 0.2, 0.9)
+    return max(_LETTER_IN * max(len(label_text(name)) for name in names) + 0.2, 0.9)
 
 
 def row_height(policies: Mapping[str, object], pitch: float) -> float:
@@ -52,7 +52,7 @@ def lay_out_rows(
             axes.axhspan(top, top + height, color=_BAND, linewidth=0, zorder=0)
         top += height
     axes.set_ylim(top, 0)
-    axes.set_yticks(centers, list(rows) if named else [""] * len(rows))
+    axes.set_yticks(centers, [label_text(name) if named else "" for name in rows])
     axes.tick_params(axis="y", labelsize=9, labelcolor=INK, pad=6)
     axes.grid(visible=False, axis="y")
     return places
@@ -72,7 +72,7 @@ def titled_figure(
     figure = new_figure(width, height)
     figure.text(0.15 / width, 1 - 0.28 / height, title, fontsize=14, weight="bold", color=INK, va="center")
     figure.legend(
-        handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(0.13 / width, 1 - 0.48 / height),
+        handles.values(), map(label_text, handles), loc="upper left", bbox_to_anchor=(0.13 / width, 1 - 0.48 / height),
         ncols=columns, frameon=False, fontsize=9, labelcolor=INK, handlelength=1.4, columnspacing=1.4,
         handletextpad=0.6, borderpad=0, borderaxespad=0,
     )  # fmt: skip

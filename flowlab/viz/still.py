@@ -26,7 +26,7 @@ from flowlab.viz.panels import (
     trail_lines,
     two_panels,
 )
-from flowlab.viz.plot_style import ALARM, QUIET, save_png, set_heading
+from flowlab.viz.plot_style import ALARM, QUIET, label_text, plain_style, save_png, set_heading
 
 TRAILS_PER_ROLE = 24
 """More trails than this hide each other."""
@@ -40,6 +40,7 @@ def draw_still(episode: Episode, path: Path, *, title: str, note: str = "") -> N
     save_png(plot_still(episode, title, note), path)
 
 
+@plain_style()
 def plot_still(episode: Episode, title: str, note: str = "") -> Figure:
     """The figure of :func:`draw_still`. Its first two axes are the camera's view, in pixels of the camera
     turned upright, and the side view, in meters of the world frame."""
@@ -48,7 +49,9 @@ def plot_still(episode: Episode, title: str, note: str = "") -> Figure:
     _draw_side_view(side, episode)
     _draw_legend(figure, episode)
     draw_time_bar(figure, float(episode.time_s[-1]), "time [s]")
-    figure.text(LEFT, 0.91, shorten(note, 170, placeholder=" …"), fontsize=10, color=ALARM, va="center")
+    figure.text(
+        LEFT, 0.91, label_text(shorten(note, 170, placeholder=" …"), 180), fontsize=10, color=ALARM, va="center"
+    )
     return figure
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from flowlab.viz.plot_style import INK, QUIET, policy_colors, save_png, style_axes
+from flowlab.viz.plot_style import INK, QUIET, plain_style, policy_colors, save_png, style_axes
 from flowlab.viz.row_chart import (
     AXIS_IN,
     HEADING_IN,
@@ -59,6 +59,7 @@ def draw_success(panels: Sequence[SuccessPanel], labels: Sequence[str], png: Pat
     save_png(plot_success(panels, labels), png)
 
 
+@plain_style()
 def plot_success(panels: Sequence[SuccessPanel], labels: Sequence[str]) -> Figure:
     """Policies side by side in every task: a dot, its interval, and a diamond for what the paper reports."""
     colors = policy_colors(labels)

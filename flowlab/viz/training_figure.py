@@ -19,6 +19,7 @@ from flowlab.viz.plot_style import (
     SERIES,
     TICK_PT,
     new_figure,
+    plain_style,
     save_png,
     set_title,
     style_axes,
@@ -79,6 +80,7 @@ def draw_training(metrics: Path, png: Path) -> None:
     save_png(plot_training(read_metrics(metrics), metrics.absolute().parent.name), png)
 
 
+@plain_style()
 def plot_training(lines: Sequence[MetricsLine], title: str) -> Figure:
     """The figure of :func:`draw_training`: a column for training, if lines tell of it, and for each of :data:`COLUMNS`
     that validation lines tell of."""

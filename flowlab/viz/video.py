@@ -1,6 +1,5 @@
 """An episode as a video: its pictures, and where its tracks put the query points in them."""
 
-import os
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -9,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from flowlab.errors import DataError
-from flowlab.files import temporary_path
+from flowlab.files import output_file
 from flowlab.records import Episode, FlowPrediction
 from flowlab.viz.caption_bar import CaptionBar
 from flowlab.viz.orientation import is_upside_down
@@ -43,13 +42,8 @@ def write_video(
     overlay = Overlay(episode, pictures.scale, max(1, round(trail_s * mean_fps(episode))), prediction)
     name, width = title or f"{episode.task}, seed {episode.seed}", pictures.scale * episode.camera.width
     bar = CaptionBar(episode, width, name, note, predicted=prediction is not None)
-    temporary = temporary_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with output_file(path) as temporary:
         _encode(temporary, rate, (_frame(pictures, overlay, bar, t) for t in range(len(episode))))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def mean_fps(episode: Episode) -> float:

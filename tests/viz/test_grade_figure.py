@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.grading.ground_truth import GroundTruth
 from flowlab.grading.metrics import CURVE_MM, EstimatedTracks, TrackMetrics, measure
@@ -69,7 +70,7 @@ def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError("no space is left")
 
     monkeypatch.setattr("os.replace", fails)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(DataError, match="no space"):
         draw_grades({"only": make_metrics(0.02)}, path, title="lost")
     assert path.read_bytes() == before
     assert [f.name for f in path.parent.iterdir()] == ["grade.png"]

@@ -20,6 +20,7 @@ from synthetic import (
     make_receipt,
 )
 
+from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Queries, Role, Tracks3D
 from flowlab.storage.dataset import begin
@@ -217,9 +218,9 @@ def test_a_failure_leaves_the_old_file_alone(episode: Episode, tmp_path: Path) -
 def test_nothing_is_left_where_the_file_cannot_be_put(episode: Episode, tmp_path: Path) -> None:
     for name in ("e.rrd", "e.png"):
         (tmp_path / name).mkdir()
-    with pytest.raises(OSError, match="rrd"):
+    with pytest.raises(DataError, match="rrd"):
         write_rrd(episode, tmp_path / "e.rrd", name="slide")
-    with pytest.raises(OSError, match="png"):
+    with pytest.raises(DataError, match="png"):
         draw_still(episode, tmp_path / "e.png", title="slide")
     assert {p.name for p in tmp_path.iterdir()} == {"e.rrd", "e.png"}
 
@@ -499,5 +500,5 @@ def test_a_place_that_cannot_be_written_is_one_sentence(
 ) -> None:
     (tmp_path / "file").touch()
     code, _, errors = call_cli(capsys, "viz", pours, option, tmp_path / "file" / "picture")
-    assert code == 1
+    assert code == 3
     assert "file/picture: cannot be written" in "".join(errors.splitlines())

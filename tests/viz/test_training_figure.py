@@ -205,7 +205,7 @@ def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError("no space is left")
 
     monkeypatch.setattr("os.replace", fails)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(DataError, match="no space"):
         draw_training(metrics, path)
     assert path.read_bytes() == before
     assert [f.name for f in path.parent.iterdir()] == ["curve.png"]

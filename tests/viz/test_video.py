@@ -246,6 +246,6 @@ def test_a_failure_leaves_the_old_film_alone(episode: Episode, tmp_path: Path, m
 
 def test_nothing_is_left_where_the_film_cannot_be_put(episode: Episode, tmp_path: Path) -> None:
     (tmp_path / "e.mp4").mkdir()
-    with pytest.raises(OSError, match=r"e\.mp4"):
+    with pytest.raises(DataError, match=r"e\.mp4"):
         write_video(episode, tmp_path / "e.mp4")
     assert [p.name for p in tmp_path.iterdir()] == ["e.mp4"]

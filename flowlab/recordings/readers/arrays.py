@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flowlab.errors import DataError
+from flowlab.files import scratch_folder
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
@@ -74,7 +75,7 @@ class ArraysReader:
             )
         if missing:
             raise DataError(f"{path}: has no array for {missing[0]}; it may be called {', '.join(NAMES[missing[0]])}")
-        store = _Store(path, names, None if path.is_dir() else tempfile.TemporaryDirectory(prefix="flowlab-"))
+        store = _Store(path, names, None if path.is_dir() else scratch_folder())
         color, depth = store.load("color"), store.load("depth")
         assert color is not None
         assert depth is not None
