@@ -363,7 +363,7 @@ def test_resume_goes_on_as_the_run_began(rolls: Path, taught: Path, tmp_path: Pa
     assert files_below(tmp_path) == before
     code, out, err = call_cli(capsys, "train", rolls, "--resume")
     assert (code, out) == (3, "")
-    assert f"{rolls}: no run to resume (it has no run.json); start one with 'flowlab train DATASET --out'" in err
+    assert f"{rolls}: not a training run (it has no policy.json); what a kill left of one begins again" in err
 
 
 def test_bf16_is_refused_where_it_would_be_slower(
@@ -380,12 +380,16 @@ def test_bf16_is_refused_where_it_would_be_slower(
     assert json.loads((tmp_path / "b/run.json").read_text())["precision"] == "fp32"
 
 
-def test_a_dataset_that_cannot_be_written_to_is_trained_on(tmp_path: Path, capsys: Capture) -> None:
-    """Its arrays are then decoded into the folder of the run; for a root user, a file in the way must do."""
+def test_where_the_cache_cannot_be_written_arrays_are_decoded_into_the_run(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a root user, a file in the way must do. The dataset is never written to; the same command goes on there."""
     make_rolls(tmp_path / "d")
-    (tmp_path / "d/cache").write_text("in the way")
+    (tmp_path / "cache").write_text("in the way")
+    monkeypatch.setenv("FLOWLAB_CACHE", str(tmp_path / "cache"))
     before = files_below(tmp_path / "d")
-    train(capsys, tmp_path / "d", "--policy", "fdp", "--out", tmp_path / "run", *SMALL)
+    for _ in range(2):
+        train(capsys, tmp_path / "d", "--policy", "dp3", "--out", tmp_path / "run", *SMALL)
     assert files_below(tmp_path / "d") == before
     assert sorted(p.name for p in (tmp_path / "run").iterdir()) == sorted([*KEPT, "cache", "checkpoints"])
 
