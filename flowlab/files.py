@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import socket
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -84,12 +83,6 @@ def new_file(path: Path) -> Iterator[Path]:
         sync_folder(path.parent)
     finally:
         _remove(temporary)
-
-
-def scratch_folder() -> "tempfile.TemporaryDirectory[str]":
-    """A folder of this process among the system's temporary ones; those of flowlab that a kill left there go first."""
-    remove_leftovers(Path(tempfile.gettempdir()))
-    return tempfile.TemporaryDirectory(prefix=f"{_prefix()}{os.getpid()}+flowlab-")
 
 
 @contextmanager

@@ -4,10 +4,14 @@ Written into the manifest by the stages that know, each its own part; read by tr
 dataset card. Nobody asks for the name of a stage.
 """
 
+import json
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, Self
+
+from pydantic import Field, NonNegativeInt, model_validator
 
 from flowlab.config import Settings
+from flowlab.text import cut, shown
 
 
 class Channels(Settings):
@@ -15,7 +19,7 @@ class Channels(Settings):
 
     name: str
     """``hand``, ``left finger``, ``gripper``."""
-    index: tuple[int, ...]
+    index: tuple[NonNegativeInt, ...] = Field(min_length=1)
     """Their places in the state or action, from 0."""
     kind: Literal["position", "displacement", "rotation", "joint", "effort", "other"]
     """``position`` and ``displacement`` are triples along x, y, z of ``frame``."""
@@ -24,6 +28,16 @@ class Channels(Settings):
     empty where the numbers have none."""
     unit: str
     """``m``, ``cm``, ``rad``, ``1``."""
+
+    @model_validator(mode="after")
+    def _places_fit(self) -> Self:
+        if len(set(self.index)) < len(self.index):
+            raise ValueError(f"index of '{cut(self.name)}' names a place twice: {shown(self.index)}")
+        if self.kind in ("position", "displacement") and len(self.index) != 3:
+            raise ValueError(
+                f"index of '{cut(self.name)}' is {shown(self.index)}, expected three places for a {self.kind}"
+            )
+        return self
 
 
 class Provenance(Settings):
@@ -53,7 +67,54 @@ class Provenance(Settings):
     tracker: str = ""
     """Name of what estimated them."""
 
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if (self.tracks == "estimated") != bool(self.tracker):
+            raise ValueError(
+                f"tracks are '{self.tracks}', and the tracker is {shown(self.tracker)}; say both or neither"
+            )
+        for name in ("scene", "camera", "observer", "queries"):
+            _check_json(name, getattr(self, name))
+        if self.action_limits is not None:
+            _check_limits(*self.action_limits)
+            if problem := self.width_problem(action=len(self.action_limits[0])):
+                raise ValueError(f"{problem}, as many as there are limits")
+        return self
+
+    def width_problem(self, state: int | None = None, action: int | None = None) -> str:
+        """What does not fit a state or an action of so many numbers, in words; empty where everything does."""
+        for what, channels, width in (("state", self.state, state), ("action", self.action, action)):
+            for c in channels or ():
+                if width is not None and max(c.index) >= width:
+                    return f"{what}: the channel '{cut(c.name)}' has number {max(c.index)}, and there are {width}"
+        if action is not None and self.action_limits is not None and len(self.action_limits[0]) != action:
+            return f"action_limits: there are {len(self.action_limits[0])}, and the action has {action} numbers"
+        return ""
+
     @property
     def is_simulated(self) -> bool:
         """Whether a simulator made the episodes, so that an episode's seed decides its scene."""
         return self.kind == "simulated"
+
+
+def _check_json(name: str, values: Any) -> None:
+    """Refuse what cannot be written into a manifest and read back."""
+    try:
+        json.dumps(values, allow_nan=False, default=_as_settings)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{name}: holds what is no JSON ({cut(str(error))})") from error
+
+
+def _as_settings(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"{type(value).__name__} {shown(value)}")
+
+
+def _check_limits(low: tuple[float, ...], high: tuple[float, ...]) -> None:
+    """Refuse limits that are none."""
+    if len(low) != len(high) or not low:
+        raise ValueError(f"action_limits: there are {len(low)} least and {len(high)} greatest values, expected as many")
+    for k, (a, b) in enumerate(zip(low, high, strict=True)):
+        if not a <= b:
+            raise ValueError(f"action_limits: number {k} is from {a:g} to {b:g}, expected the least value first")

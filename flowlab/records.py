@@ -84,6 +84,10 @@ class Observation(Record):
     count: int
     """How many of the points are distinct; the rest repeat them (or are zero, in the DP3 profile)."""
 
+    def _check_values(self) -> None:
+        if not 0 <= self.count <= len(self.points_world):
+            raise self._wrong("count", f"is {self.count}, expected 0 to {len(self.points_world)}, the number of points")
+
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Queries(Record):
@@ -121,6 +125,10 @@ class Clip(Record):
     def __len__(self) -> int:
         return len(self.rgb)
 
+    def _check_values(self) -> None:
+        if self.depth.size and (least := np.nanmin(self.depth)) < 0:
+            raise self._wrong("depth", f"is {least:g} m at some pixel, expected 0 or more")
+
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Tracks2D(Record):
@@ -141,6 +149,13 @@ class Tracks2D(Record):
     where none does."""
     residual: Float32[np.ndarray, "T M"] | None = None
     """How badly that model explains color and depth around the point, 0 to 1; -1 where none does."""
+
+    def _check_values(self) -> None:
+        if not np.isfinite(self.xy).all():
+            raise self._wrong("xy", "holds a number that is not finite, expected a held position where a point is lost")
+        if not ((self.confidence >= 0) & (self.confidence <= 1)).all():
+            found = f"{self.confidence.min():g} to {self.confidence.max():g}"
+            raise self._wrong("confidence", f"ranges from {found}, expected 0 to 1")
 
 
 class PositionSource(IntEnum):
@@ -219,6 +234,9 @@ class Demonstration(Record, ABC):
     def __len__(self) -> int:
         return len(self.action)
 
+    def _check_values(self) -> None:
+        _check_rows(self)
+
     @abstractmethod
     def frame(self, t: int) -> Frame:
         """The picture taken at step ``t``, before action ``t``.
@@ -286,6 +304,17 @@ class Episode(Record):
     def __len__(self) -> int:
         return len(self.action)
 
+    def check_numbers(self) -> None:
+        """Refuse what nobody may store. An episode that is read may have it: a damaged dataset has to be looked into.
+
+        Raises:
+            RecordError: Times do not rise, numbers of the robot are not finite, or counts cannot be.
+        """
+        _check_rows(self)
+        low, high, most = self.point_count.min(initial=0), self.point_count.max(initial=0), self.point_cloud.shape[1]
+        if not 0 <= low <= high <= most:
+            raise self._wrong("point_count", f"ranges from {low} to {high}, expected 0 to {most}")
+
     @property
     def flow(self) -> Float[np.ndarray, "T M 3"]:
         """Displacement [m] of every query point during action t; zero for the last row."""
@@ -296,3 +325,15 @@ class Episode(Record):
         """The :class:`Role` of every query's owner, -1 where it is not known."""
         roles = np.array([e.role for e in self.queries.entities] + [-1])
         return roles[self.queries.owner]
+
+
+def _check_rows(of: Demonstration | Episode) -> None:
+    """Refuse times that do not rise, and numbers of the robot that are none."""
+    for name in ("time_s", "state", "action"):
+        if not np.isfinite(values := getattr(of, name)).all():
+            raise of._wrong(name, f"is not finite in row {int(np.argwhere(~np.isfinite(values))[0][0])}")
+    if len(of.time_s) > 1 and not (np.diff(of.time_s) > 0).all():
+        row = int(np.argmin(np.diff(of.time_s) > 0)) + 1
+        raise of._wrong("time_s", f"is {of.time_s[row]:g} s in row {row} after {of.time_s[row - 1]:g} s, expected more")
+    if of.seed < 0:
+        raise of._wrong("seed", f"is {of.seed}, expected 0 or more")

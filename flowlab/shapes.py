@@ -7,7 +7,7 @@ it, and so must records within records.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -51,8 +51,11 @@ class Record:
 
     def _fitting(self) -> dict[str | int, int] | None:
         """Those lengths; None where anything may be wrong. Quick, for records are made at every step."""
-        arrays, inner, fixed = _declared(type(self))  # type: ignore[arg-type]
+        arrays, inner, fixed, plain = _declared(type(self))  # type: ignore[arg-type]
         found = dict(fixed)
+        for field in plain:
+            if not field.fits(getattr(self, field.name)):
+                return None
         for name, kinds in inner:
             value = getattr(self, name)
             if not isinstance(value, kinds):
@@ -64,7 +67,7 @@ class Record:
             value = getattr(self, array.name)
             if value is None and array.optional:
                 continue
-            if not isinstance(value, np.ndarray) or value.dtype.kind not in array.kinds:
+            if not _is_array(value) or value.dtype.kind not in array.kinds:
                 return None
             if value.ndim != len(array.dims):
                 return None
@@ -76,7 +79,10 @@ class Record:
     def sizes(self) -> dict[str, Size]:
         """Length of every named dimension. Raises :class:`RecordError` where arrays do not agree."""
         found: dict[str, Size] = {}
-        declared, inner, _ = _declared(type(self))  # type: ignore[arg-type]
+        declared, inner, _, plain = _declared(type(self))  # type: ignore[arg-type]
+        for field in plain:
+            if not field.fits(value := getattr(self, field.name)):
+                raise self._wrong(field.name, f"is {_short(value)}, expected {field.expected}")
         for name, kinds in inner:
             value = getattr(self, name)
             if not isinstance(value, kinds):
@@ -102,7 +108,7 @@ class Record:
             raise self._wrong(size.where, f"is {size.length} long in {dim}, and {known.where} is {known.length}")
 
     def _check_array(self, array: "_Array", value: Any, found: dict[str, Size]) -> None:
-        if not isinstance(value, np.ndarray):
+        if not _is_array(value):
             raise self._wrong(array.name, f"is {type(value).__name__}, expected a NumPy array of {array.expected}")
         if value.dtype.kind not in array.kinds:
             raise self._wrong(array.name, f"is {value.dtype}, expected {array.expected}{_remedy(array.name, value)}")
@@ -129,18 +135,57 @@ class _Array:
     optional: bool
 
 
+@dataclass(frozen=True, slots=True)
+class _Plain:
+    """A field that holds a number, text, names and values, or some things of one class, by its annotation."""
+
+    name: str
+    kind: type
+    of: type | None = None
+    """What all in a tuple are."""
+
+    @property
+    def expected(self) -> str:
+        """What will do, in words."""
+        words = {int: "a whole number", str: "text", Mapping: "names and values"}
+        return words.get(self.kind) or f"a tuple of {self.of.__name__ if self.of else 'values'}"
+
+    def fits(self, value: Any) -> bool:
+        """Whether a value will do."""
+        if self.kind is int:
+            return type(value) is int or (isinstance(value, int | np.integer) and not isinstance(value, bool))
+        if not isinstance(value, self.kind):
+            return False
+        return self.of is None or not isinstance(value, tuple) or all(isinstance(v, self.of) for v in value)
+
+
 _Inner = tuple[str, tuple[type, ...]]
 """A field that holds a record: its name, and what may stand in it, such as Quality or None."""
 
 
 @cache
-def _declared(cls: type) -> tuple[tuple[_Array, ...], tuple[_Inner, ...], dict[str | int, int]]:
-    """The arrays of a record, the records in it, and the dimensions whose name is their length."""
+def _declared(cls: type) -> tuple[tuple[_Array, ...], tuple[_Inner, ...], dict[str | int, int], tuple[_Plain, ...]]:
+    """The arrays of a record, the records in it, the dimensions whose name is their length, and its other fields."""
     hints = get_type_hints(cls)
     names = [f.name for f in fields(cls)]
     arrays = tuple(array for name in names if (array := _array(name, hints[name])) is not None)
     fixed: dict[str | int, int] = {dim: dim for array in arrays for dim in array.dims if isinstance(dim, int)}
-    return arrays, tuple((name, kinds) for name in names if (kinds := _record_types(hints[name]))), fixed
+    inner = tuple((name, kinds) for name in names if (kinds := _record_types(hints[name])))
+    plain = tuple(field for name in names if (field := _plain(name, hints[name])) is not None)
+    return arrays, inner, fixed, plain
+
+
+def _plain(name: str, hint: Any) -> _Plain | None:
+    if hint in (int, str):
+        return _Plain(name, hint)
+    if get_origin(hint) is Mapping:
+        return _Plain(name, Mapping)
+    return _Plain(name, tuple, get_args(hint)[0]) if get_origin(hint) is tuple else None
+
+
+def _is_array(value: Any) -> bool:
+    """Whether a value is an array whose numbers all count: of a masked one some do not."""
+    return isinstance(value, np.ndarray) and not isinstance(value, np.ma.MaskedArray)
 
 
 def _array(name: str, hint: Any) -> _Array | None:
@@ -192,7 +237,7 @@ def _short(value: Any) -> str:
     if isinstance(value, Mapping):
         return f"{{{', '.join(_keys(value))}}}"
     if isinstance(value, tuple | list):
-        return f"{len(value)} x {type(value[0]).__name__}"
+        return f"{len(value)} x {type(value[0]).__name__}" if value else f"an empty {type(value).__name__}"
     return f"{type(value).__name__}(...)"
 
 

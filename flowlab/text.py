@@ -59,6 +59,12 @@ def cut(text: str, limit: int = MAX_SHOWN) -> str:
     return line if len(line) <= limit else line[:limit] + "..."
 
 
+def is_path_inside(name: str) -> bool:
+    """Whether text names a file in or below a folder, without leading out of it."""
+    parts = name.split("/")
+    return bool(name) and not name.startswith("/") and ".." not in parts and not _UNPRINTABLE.search(name)
+
+
 def is_plain_name(name: str) -> bool:
     """Whether text can name a file in a folder, and nothing outside of it."""
     fits = 0 < len(name.encode("utf-8", "surrogatepass")) <= _LONGEST_NAME

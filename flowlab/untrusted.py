@@ -51,7 +51,7 @@ def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
     try:
         return read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is no UTF-8 text (byte {error.start})") from error
+        raise DataError(f"{path}: is no UTF-8 text (byte {error.start}); save it as UTF-8") from error
 
 
 def read_json(path: Path, advice: str = _RESTORE) -> Any:

@@ -1,11 +1,13 @@
 """Small episodes made by hand: a ball rolls over a plate, and every point lies on one of the two."""
 
 import json
+import os
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -200,10 +202,11 @@ def call_cli(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tupl
     """Exit code, output and error output of the command line, run here: quick, and any traceback is a failure."""
     capsys.readouterr()
     code: Any = 0
-    try:
-        main(*map(str, arguments))
-    except SystemExit as end:
-        code = end.code
+    with patch.dict(os.environ):  # it sets some for the Pythons that libraries start
+        try:
+            main(*map(str, arguments))
+        except SystemExit as end:
+            code = end.code
     return code, *capsys.readouterr()
 
 

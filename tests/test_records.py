@@ -12,7 +12,7 @@ from synthetic import CAMERA, make_episode, with_quality
 import flowlab.records
 from flowlab.errors import DataError, RecordError
 from flowlab.geometry.camera import Camera
-from flowlab.records import Clip, Entity, Episode, Frame, Queries, Role, Tracks2D
+from flowlab.records import Clip, Entity, Episode, Frame, Observation, Queries, Role, Tracks2D
 from flowlab.shapes import Record
 
 
@@ -167,3 +167,35 @@ def test_every_record_shares_the_checks_and_the_repr() -> None:
     for cls in arrays:
         assert issubclass(cls, Record), cls
         assert cls.__repr__ is Record.__repr__, cls
+
+
+D = np.ones((12, 16), np.float32)
+NOWHERE = np.zeros((2, 3, 2), np.float32)
+SEEN, SURE = np.ones((2, 3), bool), np.ones((2, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda e: Frame(np.ma.masked_array(D), CAMERA), r"Frame\.depth is MaskedArray"),
+        (lambda e: Frame(D, CAMERA, entities=(1, 2)), r"Frame\.entities is 2 x int, expected a tuple of Entity"),
+        (lambda e: Clip(np.zeros((1, 12, 16, 3), np.uint8), -D[None], CAMERA), r"Clip\.depth is -1 m"),
+        (lambda e: replace(e.queries, count=1.5), r"Queries\.count is 1\.5, expected a whole number"),
+        (lambda e: replace(e.queries, count="2"), r"Queries\.count is '2', expected a whole number"),
+        (lambda e: Observation(np.zeros((2, 3), np.float32), -1), r"Observation\.count is -1, expected 0 to 2"),
+        (lambda e: Tracks2D(NOWHERE * np.nan, SEEN, SURE), r"Tracks2D\.xy holds a number that is not finite"),
+        (lambda e: Tracks2D(NOWHERE, SEEN, SURE * 7), r"Tracks2D\.confidence ranges from 7 to 7, expected 0 to 1"),
+        (lambda e: Camera(128.5, 2, CAMERA.K, np.eye(4)), r"Camera\.width is 128\.5, expected a whole number"),
+        (lambda e: Camera("a", 2, CAMERA.K, np.eye(4)), r"Camera\.width is 'a'"),
+        (lambda e: replace(e, task=3), r"Episode\.task is 3, expected text"),
+        (lambda e: replace(e, seed="x"), r"Episode\.seed is 'x', expected a whole number"),
+        (lambda e: replace(e, extras=[1]), r"Episode\.extras is 1 x int, expected names and values"),
+        (lambda e: replace(e, time_s=e.time_s[::-1].copy()).check_numbers(), r"Episode\.time_s is .* s in row 1 after"),
+        (lambda e: replace(e, state=e.state * np.nan).check_numbers(), r"Episode\.state is not finite in row 0"),
+        (lambda e: replace(e, point_count=e.point_count + 1).check_numbers(), "point_count ranges from 0 to 65"),
+        (lambda e: replace(e, seed=-1).check_numbers(), r"Episode\.seed is -1, expected 0 or more"),
+    ],
+)  # fmt: skip
+def test_odd_values_are_one_sentence(make: Callable[[Episode], Any], sentence: str) -> None:
+    with pytest.raises(RecordError, match=sentence):
+        make(make_episode())

@@ -1,14 +1,16 @@
 """Trials on a robot that a person scored: read from CSV, counted, and compared."""
 
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import TextIO
 
 from flowlab.benchmark.statistics import PairedComparison, Proportion, mcnemar, wilson
 from flowlab.errors import DataError, unknown_name
+from flowlab.text import cut, shown
+from flowlab.untrusted import read_text
 
 COLUMNS = ("policy", "task", "trial", "success")
 """Every file has these, in any order."""
@@ -51,26 +53,20 @@ class RobotComparison:
 
 def read_robot_trials(path: Path) -> list[RobotTrial]:
     """The trials in a file, in its order. Raises :class:`DataError` with the line and column of what is wrong."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:  # Excel begins its files with a mark
-            rows = _rows(path, file)
-            line, header = next(rows, (1, []))
-            columns = _check_header(f"{path}: line {line}", header)
-            lines: dict[tuple[str, str, str], int] = {}
-            found = []
-            for line, row in rows:
-                trial = _trial(f"{path}: line {line}", columns, row)
-                first = lines.setdefault((trial.policy, trial.task, trial.trial), line)
-                if first != line:
-                    raise DataError(
-                        f"{path}: line {line}: trial '{trial.trial}' of {trial.policy} on {trial.task} is on line "
-                        f"{first} already; give it another name in column 'trial', or delete one of the lines"
-                    )
-                found.append(trial)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is no UTF-8 text; save it as CSV UTF-8") from error
+    rows = _rows(path, read_text(path))  # which passes over the mark that Excel's files begin with
+    line, header = next(rows, (1, []))
+    columns = _check_header(f"{path}: line {line}", header)
+    lines: dict[tuple[str, str, str], int] = {}
+    found = []
+    for line, row in rows:
+        trial = _trial(f"{path}: line {line}", columns, row)
+        first = lines.setdefault((trial.policy, trial.task, trial.trial), line)
+        if first != line:
+            raise DataError(
+                f"{path}: line {line}: trial {shown(trial.trial)} of {cut(trial.policy)} on {cut(trial.task)} is on "
+                f"line {first} already; give it another name in column 'trial', or delete one of the lines"
+            )
+        found.append(trial)
     if not found:
         raise DataError(f"{path}: holds no trials; expected a line for each below the header {','.join(COLUMNS)}")
     return found
@@ -98,9 +94,9 @@ def comparisons(trials: Sequence[RobotTrial]) -> list[RobotComparison]:
     ]
 
 
-def _rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
+def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
     """Lines that are not empty: the number of each, and its cells without blanks around them."""
-    reader = csv.reader(file, strict=True)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
@@ -119,11 +115,11 @@ def _check_header(where: str, header: list[str]) -> list[str]:
             hint = "; separate columns by commas" if ";" in name or "\t" in name else ""
             raise DataError(f"{where}: {unknown_name('column', name, (*COLUMNS, NOTE))}{hint}")
         if header.count(name) > 1:
-            raise DataError(f"{where}: column '{name}' is there {header.count(name)} times; delete all but one")
+            raise DataError(f"{where}: column {shown(name)} is there {header.count(name)} times; delete all but one")
     lacking = [name for name in COLUMNS if name not in header]
     if lacking:
         raise DataError(
-            f"{where}: has no column '{lacking[0]}' (found {', '.join(header) or 'nothing'}); expected a header "
+            f"{where}: has no column '{lacking[0]}' (found {cut(', '.join(header)) or 'nothing'}); expected a header "
             f"{','.join(COLUMNS)}, with {NOTE} if there are any"
         )
     return header
@@ -142,7 +138,9 @@ def _trial(where: str, columns: list[str], row: list[str]) -> RobotTrial:
             raise DataError(f"{where}: column '{name}' is empty; fill it in")
     solved = _SUCCESS.get(cells["success"].lower())
     if solved is None:
-        raise DataError(f"{where}: column 'success' is '{cells['success']}'; expected one of {', '.join(_SUCCESS)}")
+        raise DataError(
+            f"{where}: column 'success' is {shown(cells['success'])}; expected one of {', '.join(_SUCCESS)}"
+        )
     return RobotTrial(cells["policy"], cells["task"], cells["trial"], solved, cells.get(NOTE, ""))
 
 
@@ -153,7 +151,8 @@ def _by_policy(trials: Sequence[RobotTrial]) -> dict[str, dict[tuple[str, str], 
         of_policy = tried.setdefault(x.policy, {})
         if (x.task, x.trial) in of_policy:
             raise DataError(
-                f"trial '{x.trial}' of {x.policy} on {x.task} is scored twice, in two files; give it another name in "
+                f"trial {shown(x.trial)} of {cut(x.policy)} on {cut(x.task)} is scored twice, in two files; "
+                "give it another name in "
                 "one of them"
             )
         of_policy[x.task, x.trial] = x.success

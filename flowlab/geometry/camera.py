@@ -132,8 +132,8 @@ class Camera(Record):
             ``width``, ``height``, ``K`` and ``T_world_cam``, matrices row by row.
         """
         return {
-            "width": self.width,
-            "height": self.height,
+            "width": int(self.width),
+            "height": int(self.height),
             "K": self.K.tolist(),
             "T_world_cam": self.T_world_cam.tolist(),
         }

@@ -1,16 +1,15 @@
 """True tracks beside a recording, and how they are read: ``ground_truth.npz``."""
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int8
-from numpy.lib.npyio import NpzFile
 
-from flowlab.errors import DataError
-from flowlab.text import natural_key
+from flowlab.array_files import load_arrays
+from flowlab.errors import DataError, MissingFileError
+from flowlab.records import Role
+from flowlab.text import cut, natural_key, shown
 from flowlab.untrusted import read_json
 
 FILE_NAME = "ground_truth.npz"
@@ -63,7 +62,13 @@ def find_with_truth(path: Path) -> list[Path]:
 def unusable_queries(recording: Path) -> int:
     """How many queries were left out of a simulated recording; 0 for any other."""
     made = recording / MADE_WITH
-    return int(read_json(made)["unusable_queries"]) if made.is_file() else 0
+    if not made.is_file():
+        return 0
+    values = read_json(made, "simulate it again")
+    found = values.get("unusable_queries") if isinstance(values, dict) else None
+    if type(found) is not int or found < 0:
+        raise DataError(f"{made}: 'unusable_queries' is {shown(found)}, expected a whole number from 0 on")
+    return found
 
 
 def read(path: Path) -> GroundTruth:
@@ -74,26 +79,19 @@ def read(path: Path) -> GroundTruth:
     """
     path = path / FILE_NAME if path.is_dir() else path
     try:
-        stored = np.load(path)
-        if not isinstance(stored, NpzFile):
-            raise ValueError("it holds a single array without a name")
-        with stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except FileNotFoundError as error:
+        return _checked(path, load_arrays(path))
+    except MissingFileError as error:
         raise DataError(
             f"{path}: there is no such file; 'flowlab grade' needs a recording's true tracks "
             "(query_px, tracks_cam and visible; see docs/grading.md), or --tasks to simulate recordings"
         ) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{path}: cannot be read ({error}); it must be an .npz file written by numpy.savez") from error
-    return _checked(path, arrays)
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> GroundTruth:
     """The record, once every array is known to have the right shape, type and finite values."""
     for name in ("query_px", "tracks_cam", "visible"):
         if name not in arrays:
-            raise DataError(f"{path}: has no array '{name}'; found {', '.join(sorted(arrays)) or 'none'}")
+            raise DataError(f"{path}: has no array '{name}'; found {cut(', '.join(sorted(arrays))) or 'none'}")
     query_px, tracks_cam = arrays["query_px"], arrays["tracks_cam"]
     steps, queries = tracks_cam.shape[0] if tracks_cam.ndim else 0, query_px.shape[0] if query_px.ndim else 0
     if not steps or not queries:
@@ -104,8 +102,14 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> GroundTruth:
     role = arrays.get("role")
     if role is not None:
         _check(path, "role", role, (queries,), "iu")
+        if not (role.min() >= -1 and role.max() <= max(Role)):
+            raise DataError(f"{path}: 'role' is {role.min()} to {role.max()}, expected -1 to {int(max(Role))}")
         role = role.astype(np.int8)
-    return GroundTruth(query_px.astype(np.float32), tracks_cam.astype(np.float32), arrays["visible"], role)
+    with np.errstate(over="ignore"):
+        query_px, tracks_cam = query_px.astype(np.float32), tracks_cam.astype(np.float32)
+    for name, values in (("query_px", query_px), ("tracks_cam", tracks_cam)):
+        _check(path, name, values, values.shape, "f")
+    return GroundTruth(query_px, tracks_cam, arrays["visible"], role)
 
 
 def _check(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str) -> None:

@@ -6,11 +6,14 @@ from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
-from flowlab.config import Settings
-from flowlab.errors import FlowlabError, UsageError
+from pydantic import ValidationError
+
+from flowlab.config import Settings, explain
+from flowlab.errors import FlowlabError, UsageError, first_line
 from flowlab.provenance import Provenance
 from flowlab.records import Demonstration, Episode
 from flowlab.storage.receipts import StageTally
+from flowlab.text import shown
 
 
 class Rejected(FlowlabError):
@@ -129,7 +132,7 @@ class Pipeline:
 
     def provenance(self, task: str) -> Provenance:
         """Where the episodes that this pipeline makes come from, and what their numbers mean, as its stages say."""
-        return reduce(lambda known, stage: stage.describe(known, task), self.stages, Provenance())
+        return reduce(lambda known, stage: _described(stage, known, task), self.stages, Provenance())
 
     def run(self, request: EpisodeRequest) -> Episode:
         """Make one episode. Raises :class:`Rejected`, which names the stage that did not let it pass."""
@@ -137,6 +140,7 @@ class Pipeline:
         for stage in self.stages:
             record = self._process(stage, record)
         assert isinstance(record, Episode)
+        record.check_numbers()
         return record
 
     def store(self, path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
@@ -158,6 +162,27 @@ class Pipeline:
 
     def _count(self, stage: Stage, done: StageTally) -> None:
         self.tallies[stage.stage] = self.tallies[stage.stage].plus(done)
+
+
+def _described(stage: Stage, known: Provenance, task: str) -> Provenance:
+    """What a stage adds to what is known; what it says wrong is told before anything is written."""
+    try:
+        found = stage.describe(known, task)
+    except FlowlabError:
+        raise
+    except Exception as error:  # whatever somebody's stage does
+        raise UsageError(
+            f"stage '{stage.stage}': its describe fails ({type(error).__name__}: {first_line(error)})"
+        ) from error
+    if not isinstance(found, Provenance):
+        raise UsageError(
+            f"stage '{stage.stage}': its describe returns {shown(found)}, expected a Provenance, as in "
+            "'return provenance.model_copy(update={...})'"
+        )
+    try:
+        return Provenance.model_validate(dict(found))  # which model_copy does not do
+    except ValidationError as error:
+        raise UsageError(f"stage '{stage.stage}': its describe says {explain(error, Provenance)}") from error
 
 
 def _check_joins(stages: Sequence[Stage]) -> None:

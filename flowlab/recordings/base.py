@@ -2,17 +2,19 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from flowlab.errors import DataError, UsageError, first_line
+from flowlab.config import SettingsError
+from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.recordings.metadata import Metadata
 from flowlab.registry import READERS, Plugin
+from flowlab.text import shown
 
 _LOG = logging.getLogger(__name__)
 
@@ -90,6 +92,73 @@ class Reader(Protocol):
         ...
 
 
+def read_streams(reader: Reader, path: Path, given: Metadata) -> Streams:
+    """The streams of a recording, whatever its files hold: what a reader lets through becomes one sentence.
+
+    Args:
+        reader: What reads it.
+        path: The recording.
+        given: What the user says of it.
+
+    Returns:
+        The streams, whose pictures raise nothing but :class:`BadImage`.
+
+    Raises:
+        DataError: The recording is damaged, is none that the reader can read, or the reader gives no streams.
+    """
+    try:
+        streams = reader.read(path, given)
+    except SettingsError as error:  # of calibration that the recording itself holds
+        raise DataError(f"{path}: {error}") from error
+    except FlowlabError:
+        raise
+    except Exception as error:  # damaged files lead libraries, and readers of others, to raise anything
+        raise DataError(f"{path}: the reader '{reader.name}' cannot read it ({_words(error)})") from error
+    if not isinstance(streams, Streams):
+        raise DataError(f"{path}: the reader '{reader.name}' gives {shown(streams)}, expected Streams")
+    every: tuple[Any, ...] = (streams.color, streams.depth, *streams.state, *streams.action)
+    for stream in every:
+        _check_stream(stream, f"{path}: the reader '{reader.name}'")
+    return replace(streams, color=_guarded(streams.color), depth=_guarded(streams.depth))
+
+
+def _check_stream(stream: ImageStream | SampleStream, who: str) -> None:
+    """Refuse streams whose parts do not fit together."""
+    if not isinstance(stream, ImageStream | SampleStream):
+        raise DataError(f"{who} gives {shown(stream)}, expected a stream")
+    time_s, name = stream.time_s, getattr(stream, "name", "pictures")
+    count = len(stream.values) if isinstance(stream, SampleStream) else len(stream.names)
+    if not isinstance(time_s, np.ndarray) or time_s.shape != (count,) or time_s.dtype.kind != "f":
+        found = f"{time_s.dtype}{time_s.shape}" if isinstance(time_s, np.ndarray) else shown(time_s)
+        raise DataError(f"{who} gives {found} as the times of {name}, expected {count} seconds")
+    if not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
+        raise DataError(f"{who} gives times of {name} that fall or are not finite, expected seconds that rise")
+    if isinstance(stream, SampleStream) and (stream.values.ndim != 2 or not np.isfinite(stream.values).all()):
+        raise DataError(f"{who} gives rows of {name} that are no finite numbers (rows, numbers)")
+
+
+def _guarded(stream: ImageStream) -> ImageStream:
+    """The same pictures; whatever reading one raises is a :class:`BadImage`."""
+    return replace(stream, read=partial(_read_guarded, stream.read))
+
+
+def _read_guarded(read: Callable[[int], np.ndarray], index: int) -> np.ndarray:
+    try:
+        picture = read(index)
+    except BadImage:
+        raise
+    except Exception as error:  # whatever decoders do
+        raise BadImage(f"cannot be read ({_words(error)})") from error
+    if not isinstance(picture, np.ndarray):
+        raise BadImage(f"is read as {shown(picture)}, expected an array")
+    return picture
+
+
+def _words(error: Exception) -> str:
+    """What an error says, and of which kind it is where that is not told by its words."""
+    return str(error) if isinstance(error, FlowlabError) else f"{type(error).__name__}: {first_line(error)}"
+
+
 def load_readers(name: str | None = None) -> tuple[Reader, ...]:
     """Every installed reader, in the order in which they are asked.
 
@@ -140,9 +209,7 @@ def recognizes(reader: Reader, path: Path) -> bool:
     """Whether a reader recognizes a recording; one that fails does not, and a warning says so."""
     try:
         return bool(reader.probe(path))
-    except Exception as error:  # whatever somebody's package does
-        if type(reader).__module__.startswith("flowlab."):
-            raise
+    except Exception as error:  # whatever somebody's package does, or a file that says nothing of itself
         _warn_once(f"reader '{reader.name}': fails on {path} ({first_line(error)}); it is not asked")
         return False
 

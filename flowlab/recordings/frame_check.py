@@ -104,11 +104,15 @@ def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageC
 
 def _look_at_color(picture: np.ndarray) -> _ImageCheck:
     """Color is judged by its size."""
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+        return _ImageCheck((0, 0), f"is {picture.dtype} {picture.shape}, color is uint8 (height, width, 3)")
     return _ImageCheck((picture.shape[1], picture.shape[0]))
 
 
 def _look_at_depth(counts: np.ndarray) -> _ImageCheck:
     """Depth is judged by its size and readings."""
+    if counts.ndim != 2 or counts.dtype.kind not in "iuf":
+        return _ImageCheck((0, 0), f"is {counts.dtype} {counts.shape}, depth is numbers (height, width)")
     readings = counts[counts > 0]
     readings = readings[np.isfinite(readings)]
     size = counts.shape[1], counts.shape[0]

@@ -9,6 +9,7 @@ from jaxtyping import Float, Float32, Num, UInt8
 
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
+from flowlab.limits import MAX_DEPTH_PIXELS
 from flowlab.recordings.metadata import Intrinsics, Metadata
 from flowlab.recordings.registration import Registration
 
@@ -195,5 +196,10 @@ def _registration(
         raise DataError(
             f"{path}: depth_intrinsics are for pictures of {of[0]}x{of[1]}, but these have {depth[0]}x{depth[1]}; "
             f"correct them in {write_to}"
+        )
+    if depth[0] * depth[1] > MAX_DEPTH_PIXELS:
+        raise DataError(
+            f"{path}: depth pictures of {depth[0]}x{depth[1]} pixels cannot be registered, expected at most "
+            f"{MAX_DEPTH_PIXELS:,} pixels; shrink them"
         )
     return Registration.make(camera, depth, np.array(T), K, color)

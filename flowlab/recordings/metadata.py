@@ -6,22 +6,38 @@ from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Num
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 
-from flowlab.config import Settings
+from flowlab.config import Settings, SettingsError
 from flowlab.errors import DataError, unknown_name
-from flowlab.text import shown
+from flowlab.text import cut, is_path_inside, shown
 from flowlab.untrusted import read_yaml
 
 FILE_NAME = "recording.yaml"
+_FARTHEST_M = 1e6
 Row = tuple[float, float, float, float]
 
 
-def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+def _inside(name: str) -> str:
+    """Refuse names that lead out of the recording's folder."""
+    if not is_path_inside(name):
+        raise ValueError("must name a file in the recording's folder, without '..' or a '/' at its start")
+    return name
+
+
+def _coefficients(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuse numbers of coefficients that no model has."""
+    if len(values) not in (0, 4, 5, 8, 12, 14):
+        raise ValueError(f"has {len(values)} coefficients, expected 4, 5, 8, 12 or 14, in OpenCV's order")
+    return values
+
+
+def check_rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
     """Refuse rows that are no rigid transform."""
     T = np.array(rows)
-    off = np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max()
-    if not np.isfinite(T).all() or off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or tuple(rows[3]) != (0, 0, 0, 1):
+    R = T[:3, :3]
+    off = np.abs(R @ R.T - np.eye(3)).max() if np.abs(T).max() < _FARTHEST_M else np.inf
+    if not off < 1e-3 or np.linalg.det(T[:3, :3]) < 0 or tuple(rows[3]) != (0, 0, 0, 1):
         raise ValueError(
             "must be a rigid transform: four rows of four numbers, a rotation (determinant 1) and a position [m], "
             "and the last row 0, 0, 0, 1"
@@ -29,10 +45,17 @@ def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
     return rows
 
 
-Rigid = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
+PathInside = Annotated[str, AfterValidator(_inside)]
+Rigid = Annotated[tuple[Row, Row, Row, Row], AfterValidator(check_rigid)]
 
 
-class Intrinsics(Settings):
+class _FiniteSettings(Settings):
+    """Settings whose numbers are finite."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Intrinsics(_FiniteSettings):
     """A pinhole camera, pixel centers at integer coordinates."""
 
     fx: float = Field(gt=0)
@@ -47,7 +70,7 @@ class Intrinsics(Settings):
     """Of the pictures that the numbers belong to [px]."""
     height: int | None = Field(default=None, gt=0)
     """[px]"""
-    distortion: tuple[float, ...] = Field(default=(), max_length=14)
+    distortion: Annotated[tuple[float, ...], AfterValidator(_coefficients)] = ()
     """OpenCV's coefficients k1, k2, p1, p2, k3, ...; the pictures are undistorted where there are any."""
 
     @property
@@ -64,6 +87,8 @@ class Intrinsics(Settings):
     def from_matrix(cls, K: Num[np.ndarray, "3 _"], **others: Any) -> "Intrinsics":
         """From a matrix (3, 3) or (3, 4) [px]."""
         K = np.asarray(K, float)
+        if K.ndim != 2 or K.shape[0] != 3 or K.shape[1] not in (3, 4):
+            raise SettingsError(f"the matrix of intrinsics has the shape {K.shape}, expected (3, 3) or (3, 4)")
         return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], **others)
 
     def to_yaml(self) -> str:
@@ -89,18 +114,18 @@ class Topics(Settings):
     action: str | None = None
 
 
-class Metadata(Settings):
+class Metadata(_FiniteSettings):
     """The keys of ``recording.yaml``; every one is optional where the layout itself tells."""
 
-    color: str = "color"
+    color: PathInside = "color"
     """Folder of the color pictures."""
-    depth: str = "depth"
+    depth: PathInside = "depth"
     """Folder of the depth pictures."""
     fps: float | None = Field(default=None, gt=0)
     """Pictures per second, where there is no file of times."""
-    times: str | None = None
+    times: PathInside | None = None
     """File with the time of every color picture [s], one a line; of the depth pictures too without ``depth_times``."""
-    depth_times: str | None = None
+    depth_times: PathInside | None = None
     """File with the time of every depth picture [s]."""
     intrinsics: Intrinsics | None = None
     """The color camera."""
@@ -112,13 +137,13 @@ class Metadata(Settings):
     """The depth camera, where depth is not registered to color."""
     T_color_depth: Rigid | None = None
     """Maps coordinates of the depth camera to those of the color camera [m]."""
-    state: str | None = None
+    state: PathInside | None = None
     """``.npy`` or ``.csv`` with a row of robot state per color picture, or per time of ``state_times``."""
-    state_times: str | None = None
+    state_times: PathInside | None = None
     """File with the time of every row of state [s], on the clock of the pictures."""
-    action: str | None = None
+    action: PathInside | None = None
     """Likewise, the actions."""
-    action_times: str | None = None
+    action_times: PathInside | None = None
     """File with the time of every row of actions [s]."""
     success: bool = True
     """Whether the demonstration solved its task."""
@@ -150,7 +175,7 @@ def _explain(error: ValidationError) -> str:
         inner: dict[str, type[Settings]] = {"intrinsics": Intrinsics, "depth_intrinsics": Intrinsics, "topics": Topics}
         model = inner.get(str(first["loc"][0]), Metadata) if len(first["loc"]) > 1 else Metadata
         return str(unknown_name("key", str(first["loc"][-1]), model.model_fields))
-    return f"{where}: {first['msg'].removeprefix('Value error, ')} (found {first['input']!r})"
+    return f"{cut(where)}: {first['msg'].removeprefix('Value error, ')} (found {shown(first['input'])})"
 
 
 def combine(sources: Iterable[tuple[str, Metadata]]) -> tuple[Metadata, dict[str, str]]:

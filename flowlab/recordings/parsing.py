@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
-from flowlab.recordings.base import Reader, Streams, choose_reader
+from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
@@ -118,7 +118,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     """Read the streams, find out what is known of them, and look at every picture."""
     reader = choose_reader(path, settings.reader)
     given = list(_given(path, settings))
-    streams = reader.read(path, combine(given)[0])
+    streams = read_streams(reader, path, combine(given)[0])
     for stream in (streams.color, streams.depth):
         if not len(stream):
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")

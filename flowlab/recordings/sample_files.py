@@ -4,10 +4,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Num
+from jaxtyping import Float32, Float64, Num
 
+from flowlab.array_files import load_array
 from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream
+from flowlab.text import cut, shown
+from flowlab.untrusted import read_text
 
 _TIME_COLUMNS = ("time", "time_s", "t", "timestamp", "timestamps")
 
@@ -22,7 +25,8 @@ def load_times(path: Path) -> Float64[np.ndarray, "N"]:
 
 def check_times(path: Path, time_s: Num[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
     """The same times, where they can be seconds and never fall."""
-    step = np.diff(time_s)
+    with np.errstate(invalid="ignore", over="ignore"):
+        step = np.diff(time_s)
     if not np.isfinite(time_s).all() or (step < 0).any():
         at = int(np.argmax(~(np.append(0, step) >= 0)))
         raise DataError(f"{path}: the times must rise, and entry {at + 1} ({time_s[at]}) does not")
@@ -51,23 +55,21 @@ def load_samples(
             f"{path}: has {len(values)} rows for {len(where)} {of}; give every row its time [s] in a file named "
             f"in {write_to}, as in '{name}_times: {name}_times.txt'"
         )
-    if not np.isfinite(values).all():
-        row = int(np.argmax(~np.isfinite(values).all(1)))
-        raise DataError(f"{path}: row {row + 1} holds a value that is not finite")
-    return SampleStream(name, where, values.astype(np.float32))
+    rows = to_float32(values)
+    if not np.isfinite(rows).all():
+        row = int(np.argmax(~np.isfinite(rows).all(1)))
+        raise DataError(f"{path}: row {row + 1} holds a value that is not finite, or too large for float32")
+    return SampleStream(name, where, rows)
 
 
 def _load(path: Path) -> tuple[list[str], np.ndarray]:
     """Names of columns (none where the file has none), and rows (N, D) float64."""
-    try:
-        if path.suffix.lower() == ".npy":
-            values = np.asarray(np.load(path), np.float64)
-            return [], _table(path, values)
-        return _parse(path, path.read_text())
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError, TypeError) as error:
-        raise DataError(f"{path}: is no file of numbers ({error}); expected .npy, or .csv / .txt") from error
+    if path.suffix.lower() != ".npy":
+        return _parse(path, read_text(path))
+    values = load_array(path)
+    if values.dtype.kind not in "biuf":
+        raise DataError(f"{path}: holds {cut(str(values.dtype))}, expected numbers")
+    return [], _table(path, values.astype(np.float64))
 
 
 def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
@@ -82,7 +84,7 @@ def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
     width = len(header) or len(rows[0][1])
     for n, row in rows:
         if len(row) != width or not all(map(_is_number, row)):
-            raise DataError(f"{path}: line {n} is not {width} numbers: '{' '.join(row)[:60]}'")
+            raise DataError(f"{path}: line {n} is not {width} numbers: {shown(' '.join(row))}")
     return header, np.array([row for _, row in rows], np.float64)
 
 
@@ -91,8 +93,14 @@ def _table(path: Path, values: np.ndarray) -> np.ndarray:
     if values.ndim == 1:
         values = values[:, None]
     if values.ndim != 2 or not len(values):
-        raise DataError(f"{path}: has the shape {values.shape}, expected (rows, numbers)")
+        raise DataError(f"{path}: has the shape {cut(str(values.shape))}, expected (rows, numbers)")
     return values
+
+
+def to_float32(values: Num[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """The same numbers; one too large for the type is infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
 
 
 def _is_number(text: str) -> bool:

@@ -14,7 +14,7 @@ from synthetic import call_cli, make_dataset, make_episode
 
 from flowlab.cli import console
 from flowlab.errors import DataError
-from flowlab.files import new_file, new_folder, output_file, scratch_folder
+from flowlab.files import new_file, new_folder, output_file
 from flowlab.report.csv_files import csv_text
 from flowlab.storage.dataset import Dataset
 from flowlab.text import file_name, is_plain_name, markdown
@@ -139,14 +139,6 @@ def test_a_link_laid_at_a_temporary_name_is_not_followed(kind: str, tmp_path: Pa
     WRITERS[kind](folder / "x")
     assert [p.name for p in folder.iterdir()] == ["x"]
     assert not (tmp_path / "outside").exists()
-
-
-def test_temporary_folders_of_killed_programs_are_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    (tmp_path / f".tmp-{socket.gethostname()}+4194304+flowlab-abc").mkdir()  # no process has this number
-    (tmp_path / "of-others").mkdir()
-    with scratch_folder() as folder:
-        assert {p.name for p in tmp_path.iterdir()} == {"of-others", Path(folder).name}
 
 
 def test_of_two_exports_to_one_place_one_wins_whole(tmp_path: Path) -> None:

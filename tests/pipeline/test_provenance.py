@@ -1,6 +1,7 @@
 """Where a dataset comes from is said by its stages, whoever wrote them and whatever they are called."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -102,3 +103,39 @@ def test_a_dataset_of_recordings_says_what_is_known_of_it() -> None:
     assert known.camera == {}
     assert known.queries is not None
     assert known.queries["points"] == 8
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        ("return None", "its describe returns None, expected a Provenance"),
+        ("raise KeyError('x')", r"its describe fails \(KeyError: 'x'\)"),
+        ("return known.model_copy(update={'action_limits': 'abc'})", "its describe says action_limits"),
+        ("return known.model_copy(update={'action_limits': ((1.0,), (0.0,))})", "number 0 is from 1 to 0"),
+        ("return known.model_copy(update={'action_limits': ((1.0,), (2.0, 3.0))})", "1 least and 2 greatest values"),
+        ("return known.model_copy(update={'state': 5})", "its describe says state"),
+        ("return known.model_copy(update={'scene': {'a': object()}})", "scene: holds what is no JSON"),
+        (
+            "c = Channels(name='g', index=(99,), kind='other', frame='', unit='1')\n"
+            "        return known.model_copy(update={'action': (c,), 'action_limits': ((0.0,), (1.0,))})",
+            "action: the channel 'g' has number 99, and there are 1",
+        ),
+    ],
+)
+def test_what_a_stage_says_wrong_is_told_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], body: str, sentence: str
+) -> None:
+    name = f"stage_{abs(hash(body))}"
+    (tmp_path / f"{name}.py").write_text(
+        "from flowlab.pipeline.stages.simulation import ExpertStage\nfrom flowlab.provenance import Channels\n\n\n"
+        f"class Odd(ExpertStage):\n    def describe(self, known, task):\n        {body}\n"
+    )
+    stages = [{"stage": s} for s in (f"{name}:Odd", "observer", "queries", "rigid-flow", "accept", "write")]
+    (tmp_path / "r.yaml").write_text(json.dumps({"name": "test", "episodes": 1, "stages": stages}))
+    code, _, errors = call_cli(
+        capsys, "extract-sim", "drawer-open", "--recipe", tmp_path / "r.yaml", "--out", tmp_path / "d"
+    )
+    assert code == 2, errors
+    assert f"stage '{name}:Odd'" in errors
+    assert re.search(sentence, errors)
+    assert not (tmp_path / "d/flowlab.json").exists()

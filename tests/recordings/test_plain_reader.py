@@ -211,8 +211,8 @@ def test_what_open3d_writes_needs_only_the_depth_unit(tmp_path: Path) -> None:
     [
         ({"depth": "deep"}, "no folder 'deep'; name that of the depth pictures"),
         ({"times": "t.txt"}, r"t\.txt: has 5 times for 6 pictures in color/"),
-        ({"times": "u.txt"}, r"u\.txt: cannot be read \(No such file"),
-        ({"fps": None, "state": "s.npy", "times": "six.txt"}, r"s\.npy: cannot be read"),
+        ({"times": "u.txt"}, r"u\.txt: there is no such file"),
+        ({"fps": None, "state": "s.npy", "times": "six.txt"}, r"s\.npy: there is no such file"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path: Path, keys: dict[str, Any], message: str) -> None:

@@ -50,7 +50,7 @@ def test_times_may_be_in_a_file_of_their_own(tmp_path: Path) -> None:
         ("s.csv", "1,2\n3,nan\n5,6\n", "row 2 holds a value that is not finite"),
         ("s.csv", "time,x\n0,1\n2,2\n1,3\n", r"entry 3 \(1\.0\) does not"),
         ("s.csv", "# empty\n", "holds no row"),
-        ("s.npy", "not numpy", "is no file of numbers"),
+        ("s.npy", "not numpy", "not a readable NumPy file"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -70,5 +70,5 @@ def test_times_are_one_a_line(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"state\.npy: cannot be read \(No such file"):
+    with pytest.raises(DataError, match=r"state\.npy: there is no such file"):
         load_samples(tmp_path / "state.npy", "state", None, CLOCK, "recording.yaml")

@@ -92,4 +92,4 @@ def test_a_listed_picture_that_is_missing_is_bad(tmp_path: Path) -> None:
     write_yaml(path / "recording.yaml", intrinsics=INTRINSICS)
     (path / "rgb" / f"{COLOR_S[1]:.6f}.png").unlink()
     bad = opened(path, max_bad_share=0.5).extras["bad_frames"]
-    assert bad[0] == [f"rgb/{COLOR_S[1]:.6f}.png", "cannot be read (No such file or directory)"]
+    assert bad[0] == [f"rgb/{COLOR_S[1]:.6f}.png", "cannot be read (there is no such file)"]

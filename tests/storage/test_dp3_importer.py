@@ -107,7 +107,7 @@ def test_episodes_are_read_one_at_a_time(tmp_path: Path) -> None:
     reading = store.episodes()
     next(reading)
     (tmp_path / "s/data/state/1.0").write_bytes(b"worn out")
-    with pytest.raises(DataError, match=r"s/data/state: damaged \(.+\); write the store anew"):
+    with pytest.raises(DataError, match=r"s/data/state/1.0: damaged \(.+\); write the store anew"):
         next(reading)
 
 
@@ -187,7 +187,7 @@ SHAPES = [
     (_put("data/action", lambda a: a[:, None]), r"data/action: the shape is \(255, 1, 4\), expected 2 dim"),
     (_put("data/point_cloud", lambda a: a[..., :2]), "data/point_cloud: points of 2 numbers, expected xyz first"),
     (_put("data/state", lambda a: a[:-1]), r"differ in their number of steps \(data/state 254, data/action 255, data/"),
-    (_put("data/action", lambda a: a > 0), "data/action: values of type bool, expected numbers"),
+    (_put("data/action", lambda a: a > 0), "data/action: values of type '|b1', expected numbers"),
     (_put("meta/episode_ends", lambda a: [120, 120, 255]), "episode 1 starts at row 120 and ends at row 120"),
     (_put("meta/episode_ends", lambda a: [0, 120, 255]), "episode 0 starts at row 0 and ends at row 0"),
     (_put("meta/episode_ends", lambda a: [120, 90, 255]), "episode 1 starts at row 120 and ends at row 90, expected"),
@@ -255,10 +255,12 @@ def test_damage_is_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="data/point_cloud: 1 of 3 chunks missing; write the store anew"):
         DP3Store(store)
     (store / "data/point_cloud/.zarray").write_text("{")
-    with pytest.raises(DataError, match=r"data/point_cloud: damaged \(Expecting property name.+\); write"):
+    with pytest.raises(
+        DataError, match=r"data/point_cloud/.zarray: not valid JSON \(Expecting property name.+\); write"
+    ):
         DP3Store(store)
     (store / ".zgroup").write_text("{")
-    with pytest.raises(DataError, match=f"^{tmp_path}/s: not a readable zarr v2 store"):
+    with pytest.raises(DataError, match=f"^{tmp_path}/s/.zgroup: not valid JSON"):
         DP3Store(store)
 
 
@@ -269,3 +271,32 @@ def test_states_that_are_all_zero_are_no_damage(tmp_path: Path) -> None:
     DP3Exporter().export(make_dataset(tmp_path / "d", [[episode, replace(episode, seed=4)]]), tmp_path / "s")
     assert not (tmp_path / "s/data/state/0.0").exists()
     assert [e.state.tolist() for e in DP3Store(tmp_path / "s").episodes()] == [np.zeros((12, 7)).tolist()] * 2
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"shape": [10**12, 9]}, "claims the shape"),
+        ({"chunks": [10**9, 9]}, "claims the shape"),
+        ({"shape": [10**9, 9], "chunks": [1, 9]}, "claims the shape"),
+        ({"shape": [-1, 9]}, r"'shape' is \[-1, 9\], expected whole numbers from 0 on"),
+        ({"chunks": [0, 9]}, r"'chunks' is \[0, 9\], expected whole numbers from 1 on"),
+        ({"filters": [{"id": "pickle"}]}, r"is stored by \[\{'id': 'pickle'\}\], expected numbers as they are"),
+        ({"compressor": {"id": "zlib", "level": 1}}, "is stored by"),
+        ({"dtype": "|O"}, r"values of type '\|O', expected numbers"),
+        ({"dimension_separator": "../"}, "'dimension_separator' is"),
+    ],
+)
+def test_what_an_array_may_not_claim(tmp_path: Path, change: dict[str, Any], sentence: str) -> None:
+    store = write_v2(tmp_path / "s", make_arrays((4, 3), points=4))
+    about = store / "data/state/.zarray"
+    about.write_text(json.dumps({**json.loads(about.read_text()), **change}))
+    with pytest.raises(DataError, match=sentence):
+        DP3Store(store)
+
+
+def test_a_chunk_that_unpacks_to_more_is_refused_on_its_header(tmp_path: Path) -> None:
+    store = write_v2(tmp_path / "s", make_arrays((4, 3), points=4))
+    (store / "data/state/0.0").write_bytes(Blosc(cname="zstd").encode(np.zeros(1 << 26, np.uint8)))
+    with pytest.raises(DataError, match="it unpacks to 67,108,864 bytes, expected 3,600"):
+        next(DP3Store(store).episodes())

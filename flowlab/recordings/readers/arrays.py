@@ -1,20 +1,19 @@
 """One episode as arrays, as diffusion policies keep them: an ``.npz`` file, or a folder of ``.npy`` files."""
 
-import tempfile
 import zipfile
-import zlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from flowlab.array_files import map_array, map_member
 from flowlab.errors import DataError
-from flowlab.files import scratch_folder
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
-from flowlab.recordings.sample_files import check_times
+from flowlab.recordings.sample_files import check_times, to_float32
+from flowlab.text import cut
 
 NAMES = {
     "color": ("color", "rgb", "img", "image", "images", "colors"),
@@ -36,20 +35,13 @@ class _Store:
     path: Path
     names: dict[str, str]
     """Name of each array there is, by what it is."""
-    unpacked: "tempfile.TemporaryDirectory[str] | None"
 
     def load(self, what: str) -> np.ndarray | None:
         """An array by what it is; None where there is none."""
         if what not in self.names:
             return None
         name = self.names[what]
-        try:
-            if self.unpacked is None:
-                return np.load(self.path / f"{name}.npy", mmap_mode="r")
-            with zipfile.ZipFile(self.path) as file:
-                return np.load(file.extract(f"{name}.npy", self.unpacked.name), mmap_mode="r")
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise DataError(f"{self.path}: its array '{name}' cannot be read ({error})") from error
+        return map_array(self.path / f"{name}.npy") if self.path.is_dir() else map_member(self.path, name)
 
 
 class ArraysReader:
@@ -75,7 +67,7 @@ class ArraysReader:
             )
         if missing:
             raise DataError(f"{path}: has no array for {missing[0]}; it may be called {', '.join(NAMES[missing[0]])}")
-        store = _Store(path, names, None if path.is_dir() else scratch_folder())
+        store = _Store(path, names)
         color, depth = store.load("color"), store.load("depth")
         assert color is not None
         assert depth is not None
@@ -118,15 +110,17 @@ def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.nd
     if ends is not None and np.size(ends) > 1:
         raise DataError(f"{path}: holds {np.size(ends)} episodes, one after the other; write one file per episode")
     if color.ndim != 4 or 3 not in (color.shape[-1], color.shape[1]):
-        raise DataError(f"{path}: '{names['color']}' has the shape {color.shape}, expected (steps, height, width, 3)")
+        raise DataError(
+            f"{path}: '{names['color']}' has the shape {cut(str(color.shape))}, expected (steps, height, width, 3)"
+        )
     if color.dtype != np.uint8:
         raise DataError(f"{path}: '{names['color']}' has the type {color.dtype}, expected uint8, 0 to 255, RGB")
-    if len(color) != len(depth) or depth.ndim not in (3, 4):
+    if depth.ndim not in (3, 4) or len(color) != len(depth):
         raise DataError(
-            f"{path}: '{names['depth']}' has the shape {depth.shape}, expected ({len(color)}, height, width)"
+            f"{path}: '{names['depth']}' has the shape {cut(str(depth.shape))}, expected ({len(color)}, height, width)"
         )
-    if not len(color):
-        raise DataError(f"{path}: has no steps")
+    if 0 in (*color.shape, *depth.shape):
+        raise DataError(f"{path}: has no steps, or pictures without a pixel")
 
 
 def _color(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
@@ -144,8 +138,9 @@ def _times(store: _Store, steps: int, given: Metadata) -> np.ndarray:
     """When every step was [s]."""
     time_s = store.load("time")
     if time_s is not None:
-        if time_s.shape != (steps,):
-            raise DataError(f"{store.path}: '{store.names['time']}' has the shape {time_s.shape}, expected ({steps},)")
+        if time_s.shape != (steps,) or time_s.dtype.kind not in "iuf":
+            found = f"{time_s.dtype} {cut(str(time_s.shape))}"
+            raise DataError(f"{store.path}: '{store.names['time']}' is {found}, expected numbers ({steps},)")
         return check_times(store.path, np.asarray(time_s, np.float64))
     if given.fps is None:
         where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name
@@ -163,14 +158,14 @@ def _samples(store: _Store, what: str, time_s: np.ndarray) -> tuple[SampleStream
             f"{store.path}: '{store.names[what]}' is {values.dtype} {values.shape}, "
             f"expected numbers ({len(time_s)}, width)"
         )
-    if not np.isfinite(values).all():
+    rows = to_float32(values)
+    if not np.isfinite(rows).all():
         raise DataError(f"{store.path}: '{store.names[what]}' holds values that are not finite")
-    return (SampleStream(what, time_s, np.asarray(values, np.float32)),)
+    return (SampleStream(what, time_s, rows),)
 
 
 def _known(path: Path, K: np.ndarray) -> Metadata:
     """The intrinsics that a matrix tells."""
-    K = np.asarray(K, float)
-    if K.shape[-2:] != (3, 3):
-        raise DataError(f"{path}: the intrinsics have the shape {K.shape}, expected (3, 3)")
-    return Metadata(intrinsics=Intrinsics.from_matrix(K.reshape(-1, 3, 3)[0]))
+    if K.shape[-2:] != (3, 3) or not K.size or K.dtype.kind not in "iuf":
+        raise DataError(f"{path}: the intrinsics are {K.dtype} {cut(str(K.shape))}, expected numbers (3, 3)")
+    return Metadata(intrinsics=Intrinsics.from_matrix(K.reshape(-1, 3, 3)[0].astype(float)))

@@ -1,18 +1,18 @@
 """The plain folder: ``color/``, ``depth/`` and a ``recording.yaml``; what flowlab itself writes."""
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from flowlab.errors import DataError
+from flowlab.errors import DataError, first_line
 from flowlab.recordings.base import Streams
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, load_metadata
 from flowlab.recordings.sample_files import load_times
 from flowlab.recordings.writing import write_rgbd_recording
+from flowlab.untrusted import read_json
 
 __all__ = ["PlainReader", "write_rgbd_recording"]
 
@@ -64,16 +64,18 @@ def open3d_calibration(path: Path) -> tuple[tuple[str, Metadata], ...]:
         file = path / name
         if not file.is_file():
             continue
+        values = read_json(file, f"give 'intrinsics' in {FILE_NAME}")
         try:
-            values = json.loads(file.read_text())
             K = np.array(values["intrinsic_matrix"], float).reshape(3, 3).T  # Open3D writes it by columns
             size = {"width": int(values["width"]), "height": int(values["height"])}
             found = {"intrinsics": Intrinsics.from_matrix(K, **size)}
             scale = values.get("depth_scale")
             extra = {"fps": values.get("fps"), "depth_unit_m": float(f"{1 / scale:.6g}") if scale else None}
             return ((name, Metadata(**found, **{k: v for k, v in extra.items() if v})),)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DataError(f"{file}: is not what Open3D writes ({error}); give 'intrinsics' in {FILE_NAME}") from error
+        except (AttributeError, ValueError, KeyError, TypeError, ArithmeticError) as error:
+            raise DataError(
+                f"{file}: is not what Open3D writes ({first_line(error)}); give 'intrinsics' in {FILE_NAME}"
+            ) from error
     return ()
 
 

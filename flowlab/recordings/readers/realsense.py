@@ -1,15 +1,17 @@
 """``.bag`` files of the RealSense SDK, through Open3D: extracted once into a cache, then read from there."""
 
 import hashlib
-import json
 import os
 from pathlib import Path
 
 from flowlab.errors import DataError, MissingLibraryError
 from flowlab.files import new_folder
+from flowlab.limits import MAX_ARRAY_BYTES
 from flowlab.recordings.base import Streams
 from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.readers.plain import open3d_calibration, read_folder
+from flowlab.text import cut
+from flowlab.untrusted import check_regular, read_json
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _SDK_TOPIC = b"topic=/device_"
@@ -49,6 +51,7 @@ class RealSenseReader:
 def is_sdk_bag(path: Path) -> bool:
     """Whether a ROS 1 bag has the topics of the RealSense SDK, by the list of topics at its end."""
     try:
+        check_regular(path, MAX_ARRAY_BYTES)  # to open a pipe would wait for its other end
         with path.open("rb") as file:
             head = file.read(4096)
             if not head.startswith(_MAGIC):
@@ -57,7 +60,7 @@ def is_sdk_bag(path: Path) -> bool:
             topics = file.read(1 << 20)
             file.seek(0)
             return _SDK_TOPIC in (topics or file.read(1 << 20))  # cut short, it has topics at its start only
-    except OSError:
+    except (OSError, ValueError, DataError):  # an index that lies beyond what a file can have
         return False
 
 
@@ -108,7 +111,7 @@ def _extract(path: Path, folder: Path) -> None:
             # Frame by frame, a slow consumer makes the SDK drop frames; save_frames does the least in between.
             reader.save_frames(str(folder))
         except RuntimeError as error:
-            raise DataError(f"{path}: Open3D cannot read it ({' '.join(str(error).split())})") from error
+            raise DataError(f"{path}: Open3D cannot read it ({cut(' '.join(str(error).split()))})") from error
         finally:
             if reader.is_opened():
                 reader.close()
@@ -145,7 +148,9 @@ def _depth_of(color: Path) -> Path:
 
 def _lost(folder: Path, frames: int, fps: float) -> tuple[str, ...]:
     """A note where the bag is longer than its frames."""
-    length_s = json.loads((folder / "intrinsic.json").read_text()).get("stream_length_usec", 0) / 1e6
+    values = read_json(folder / "intrinsic.json")
+    length_us = values.get("stream_length_usec", 0) if isinstance(values, dict) else 0
+    length_s = length_us / 1e6 if isinstance(length_us, int | float) else 0.0
     expected = int(length_s * fps)
     if frames >= 0.95 * expected:
         return ()

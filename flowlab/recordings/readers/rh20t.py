@@ -5,20 +5,26 @@ tcp/<ms>.npy and gripper_command/<ms>.npy in the episode or in the camera's fold
 calib/<calibration>/{intrinsics,extrinsics}.npy beside the episode or above it
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flowlab.array_files import load_array
 from flowlab.errors import DataError
 from flowlab.geometry.transforms import inverse
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import COLOR_SUFFIXES, color_stream, depth_stream, list_images
-from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
-from flowlab.recordings.readers.safe_pickle import load_pickled_mapping
+from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, check_rigid
+from flowlab.recordings.readers.safe_pickle import pickled_numbers
+from flowlab.recordings.sample_files import to_float32
+from flowlab.text import cut, is_plain_name, shown
+from flowlab.untrusted import read_json, read_text
 
+_MAX_ROW_BYTES = 1 << 20
+_LATEST_MS = 1e15
+"""In the year 33658."""
 STATE = ("tcp", "gripper_command")
 """Folders of robot state, in the order of its columns."""
 
@@ -86,19 +92,24 @@ def _about(file: Path) -> dict[str, Any]:
     """What ``metadata.json`` says that matters here."""
     if not file.is_file():
         return {}
-    try:
-        values = json.loads(file.read_text())
-        return {k: values[k] for k in ("finish_time", "rating", "calib") if values.get(k) is not None}
-    except (OSError, ValueError, AttributeError) as error:
-        raise DataError(f"{file}: not valid JSON ({error})") from error
+    values = read_json(file, "correct it, or delete it")
+    if not isinstance(values, dict):
+        raise DataError(f"{file}: holds {shown(values)}, expected names and values")
+    found = {k: values[k] for k in ("finish_time", "rating", "calib") if values.get(k) is not None}
+    for key in ("finish_time", "rating"):
+        if key in found and not (isinstance(found[key], int | float) and abs(found[key]) < _LATEST_MS):
+            raise DataError(f"{file}: '{key}' is {shown(found[key])}, expected a number")
+    return found
 
 
 def _timed(folder: Path, suffixes: Sequence[str], stop_s: float = np.inf) -> tuple[list[Path], np.ndarray]:
     """Files whose names are milliseconds, and these in seconds."""
     files = list_images(folder, suffixes)
-    strangers = [f.name for f in files if not f.stem.isdigit()]
+    strangers = [f.name for f in files if not (f.stem.isascii() and f.stem.isdecimal() and len(f.stem) < 16)]
     if strangers:
-        raise DataError(f"{folder}: '{strangers[0]}' is not named by its time in milliseconds, as RH20T's files are")
+        raise DataError(
+            f"{folder}: {shown(strangers[0])} is not named by its time in milliseconds, as RH20T's files are"
+        )
     kept = [f for f in files if int(f.stem) / 1000 <= stop_s]
     return kept, np.array([int(f.stem) / 1000 for f in kept])
 
@@ -118,13 +129,11 @@ def _rows(files: list[Path]) -> np.ndarray:
     """The arrays of files as rows of one width."""
     rows: list[np.ndarray] = []
     for file in files:
-        try:
-            row = np.atleast_1d(np.load(file)).astype(np.float32)
-        except (OSError, ValueError, EOFError) as error:
-            raise DataError(f"{file}: cannot be read ({error})") from error
+        found = np.atleast_1d(load_array(file, _MAX_ROW_BYTES))
+        row = to_float32(found) if found.dtype.kind in "biuf" else np.full(1, np.nan)
         if row.ndim != 1 or (rows and row.shape != rows[0].shape) or not np.isfinite(row).all():
             expected = f"{len(rows[0])} finite numbers as in the others" if rows else "finite numbers"
-            raise DataError(f"{file}: holds an array {row.shape}, expected {expected}")
+            raise DataError(f"{file}: holds {found.dtype} {cut(str(found.shape))}, expected {expected}")
         rows.append(row)
     return np.stack(rows)
 
@@ -134,20 +143,34 @@ def _calibration(
 ) -> tuple[tuple[tuple[str, Metadata], ...], tuple[str, ...]]:
     """Intrinsics and pose of a camera; the world is the calibration marker."""
     stamp = episode / "timestamp.txt"
-    name = stamp.read_text().split()[0] if stamp.is_file() and stamp.read_text().split() else about.get("calib")
+    words = read_text(stamp, _MAX_ROW_BYTES).split() if stamp.is_file() else []
+    name = words[0] if words else about.get("calib")
     if name is None:
         return (), ()
+    if not is_plain_name(str(name)):
+        raise DataError(f"{episode}: its calibration is called {shown(name)}, expected the name of a folder in calib/")
     folder = next((f for p in list(episode.parents)[:3] if (f := p / "calib" / str(name)).is_dir()), None)
     if folder is None:
         return (), (f"its calibration calib/{name} is not beside it",)
     values: dict[str, Any] = {}
-    K = load_pickled_mapping(folder / "intrinsics.npy").get(serial)
+    K = pickled_numbers(folder / "intrinsics.npy", serial)
     if K is not None:
-        values["intrinsics"] = Intrinsics.from_matrix(np.asarray(K))
-    T_cam_marker = load_pickled_mapping(folder / "extrinsics.npy").get(serial)
+        if len(K) not in (9, 12):
+            raise DataError(f"{folder / 'intrinsics.npy'}: has {len(K)} numbers for camera {serial}, expected 9 or 12")
+        values["intrinsics"] = Intrinsics.from_matrix(K.reshape(3, -1))
+    T_cam_marker = pickled_numbers(folder / "extrinsics.npy", serial)
     if T_cam_marker is not None:
-        T = inverse(np.asarray(T_cam_marker, float).reshape(4, 4))
-        T[3] = 0, 0, 0, 1
-        values["T_world_cam"] = T.tolist()
+        values["T_world_cam"] = _pose(folder / "extrinsics.npy", serial, T_cam_marker)
     note = "the world is the marker of the calibration" if T_cam_marker is not None else "its pose is not calibrated"
     return ((f"calib/{name}", Metadata(**values)),), (note,)
+
+
+def _pose(file: Path, serial: str, T_cam_marker: np.ndarray) -> list[list[float]]:
+    """Pose of the camera as seen from the marker."""
+    if len(T_cam_marker) != 16 or not np.isfinite(T_cam_marker).all():
+        raise DataError(f"{file}: has {len(T_cam_marker)} numbers for camera {serial}, expected 16 that are finite")
+    T: list[list[float]] = inverse(T_cam_marker.reshape(4, 4)).tolist()
+    try:
+        return [list(row) for row in check_rigid(tuple(map(tuple, [*T[:3], (0, 0, 0, 1)])))]  # type: ignore[arg-type]
+    except ValueError as error:
+        raise DataError(f"{file}: the pose of camera {serial} {error}") from error

@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from flowlab.errors import DataError, MissingLibraryError
+from flowlab.errors import DataError, MissingLibraryError, first_line
+from flowlab.limits import MAX_ARRAY_BYTES
+from flowlab.recordings.readers.ros_limits import limit_decompression, limited_memory
 from flowlab.recordings.readers.ros_messages import stamp_s
+from flowlab.text import cut
+from flowlab.untrusted import check_regular, parse_yaml, read_text
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
+
+_MAX_METADATA_BYTES = 4 << 20
+"""Of a ``metadata.yaml``, which grows with the number of topics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +45,14 @@ class RosBag:
             raise MissingLibraryError(
                 f"{path}: reading ROS recordings needs the rosbags package ({error}); 'pip install flowlab[ros]'"
             ) from error
+        _check_files(path)
+        limit_decompression()
         try:
             # Before 2023, ROS 2 recordings did not say what their messages look like.
             self._reader: AnyReader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            self._reader.open()
+            with limited_memory():
+                self._reader.open()
+                self._counts = {topic: int(about.msgcount) for topic, about in self._reader.topics.items()}
         except Exception as error:  # rosbags lets through what its parsers raise
             raise DataError(f"{path}: is no readable ROS recording ({_words(error)})") from error
 
@@ -49,8 +60,8 @@ class RosBag:
         """Topics that hold messages of these types, with how many."""
         found: dict[str, int] = {}
         for c in self._reader.connections:
-            if c.msgtype in types and self._count(c.topic):
-                found[c.topic] = self._count(c.topic)
+            if c.msgtype in types and self._counts.get(c.topic):
+                found[c.topic] = self._counts[c.topic]
         return dict(sorted(found.items()))
 
     def types(self) -> dict[str, str]:
@@ -68,13 +79,20 @@ class RosBag:
         self, topic: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[int, Any]]:
         """Time of recording [ns] and content of the messages of a topic."""
+        messages = self._reader.messages(self._connections(topic), start_ns, stop_ns)
+        while (message := self._next(topic, messages)) is not None:
+            yield message
+
+    def _next(self, topic: str, messages: Iterator[tuple[Any, int, bytes]]) -> tuple[int, Any] | None:
+        """Time of recording [ns] and content of the next message; None after the last."""
         try:
-            for connection, time_ns, raw in self._reader.messages(self._connections(topic), start_ns, stop_ns):
-                yield time_ns, self._reader.deserialize(raw, connection.msgtype)
+            with limited_memory():
+                found = next(messages, None)
+                return None if found is None else (found[1], self._reader.deserialize(found[2], found[0].msgtype))
         except DataError:
             raise
         except Exception as error:
-            raise DataError(f"{self.path}: {topic} cannot be read ({_words(error)})") from error
+            raise DataError(f"{self.path}: {cut(topic)} cannot be read ({_words(error)})") from error
 
     def index(self, topic: str) -> BagIndex:
         """When every message of a topic is from."""
@@ -99,11 +117,21 @@ class RosBag:
         """The connections of a topic."""
         return [c for c in self._reader.connections if c.topic == topic]
 
-    def _count(self, topic: str) -> int:
-        """How many messages a topic has."""
-        return self._reader.topics[topic].msgcount
-
 
 def _words(error: BaseException) -> str:
     """What an error says, on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    return cut(" ".join(str(error).split())) or type(error).__name__
+
+
+def _check_files(path: Path) -> None:
+    """Refuse devices and pipes, and a ``metadata.yaml`` that stands for more than anybody writes."""
+    if not path.is_dir():
+        check_regular(path, MAX_ARRAY_BYTES)
+        return
+    try:
+        parse_yaml(read_text(path / "metadata.yaml", _MAX_METADATA_BYTES))
+    except ValueError as error:
+        raise DataError(f"{path / 'metadata.yaml'}: not valid YAML ({first_line(error)})") from error
+    for file in path.iterdir():
+        if not file.is_dir():
+            check_regular(file, MAX_ARRAY_BYTES)

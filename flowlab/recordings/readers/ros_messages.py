@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 
 from flowlab.geometry.transforms import inverse, rigid
+from flowlab.limits import MAX_PIXELS
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.image_files import check_depth, decode_color, decode_depth
 from flowlab.recordings.metadata import Intrinsics
+from flowlab.text import shown
 
 _CHANNELS = {
     "rgb8": (np.uint8, 3), "bgr8": (np.uint8, 3), "rgba8": (np.uint8, 4), "bgra8": (np.uint8, 4),
@@ -50,11 +52,13 @@ def decode_image(message: Any) -> np.ndarray:
         return _decode_compressed(message)
     encoding = message.encoding
     if encoding not in _CHANNELS:
-        raise BadImage(f"has the encoding '{encoding}', which is not read")
+        raise BadImage(f"has the encoding {shown(encoding)}, which is not read")
     dtype, channels = _CHANNELS[encoding]
     row = message.width * channels * np.dtype(dtype).itemsize
     data = np.asarray(message.data, np.uint8)
-    if message.step < row or data.size < message.height * message.step or not message.height:
+    if not 0 < message.width * message.height <= MAX_PIXELS:
+        raise BadImage(f"says it has {message.width} x {message.height} pixels, expected 1 to {MAX_PIXELS:,}")
+    if message.step < row or data.size < message.height * message.step:
         raise BadImage(f"is truncated: {data.size} bytes for {message.height} rows of {message.step}")
     rows = data[: message.height * message.step].reshape(message.height, message.step)[:, :row]
     values = np.ascontiguousarray(rows).view(np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<"))
@@ -135,7 +139,10 @@ def relative_pose(transforms: Iterable[Any], to: str, frm: str) -> np.ndarray | 
 def _matrix(transform: Any) -> np.ndarray:
     """A Transform as a matrix (4, 4)."""
     q, t = transform.rotation, transform.translation
-    x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / np.linalg.norm([q.x, q.y, q.z, q.w])
+    length = np.linalg.norm([q.x, q.y, q.z, q.w])
+    if not 1e-6 < length < 1e6:
+        raise ValueError(f"the rotation {[q.x, q.y, q.z, q.w]} of a transform is none")
+    x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / length
     R = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],

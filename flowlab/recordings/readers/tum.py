@@ -8,6 +8,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.metadata import Intrinsics, Metadata
+from flowlab.text import is_path_inside, shown
+from flowlab.untrusted import read_text
 
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt")
 DEPTH_FACTOR = 5000
@@ -76,11 +78,7 @@ def _associations(path: Path) -> Path | None:
 def _entries(file: Path, width: int) -> list[tuple[str, ...]]:
     """Lines of a list, in the order of the time they begin with."""
     found = []
-    try:
-        lines = file.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{file}: cannot be read ({error})") from error
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_text(file).splitlines(), 1):
         parts = tuple(line.split())
         if not parts or parts[0].startswith("#"):
             continue
@@ -89,6 +87,8 @@ def _entries(file: Path, width: int) -> list[tuple[str, ...]]:
         except (ValueError, IndexError):
             times = []
         if len(parts) != width or not np.isfinite(times or [np.nan]).all():
-            raise DataError(f"{file}: line {number} is not {' '.join(['time file'] * (width // 2))}: '{line[:60]}'")
+            raise DataError(f"{file}: line {number} is not {' '.join(['time file'] * (width // 2))}: {shown(line)}")
+        if not all(is_path_inside(name) for name in parts[1::2]):
+            raise DataError(f"{file}: line {number} names {shown(line)}, expected files in the recording's folder")
         found.append(parts)
     return sorted(found, key=lambda p: float(p[0]))

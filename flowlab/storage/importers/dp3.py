@@ -1,6 +1,7 @@
 """Stores in the layout of DP3, read as demonstrations without tracks."""
 
 import hashlib
+import math
 import os
 from collections.abc import Iterator
 from functools import cached_property
@@ -14,7 +15,10 @@ from jaxtyping import Float32, Int32
 
 from flowlab.errors import DataError, first_line
 from flowlab.geometry.camera import Camera
+from flowlab.limits import MAX_LOADED_BYTES
 from flowlab.records import Episode, Queries, Tracks3D
+from flowlab.storage.importers.zarr_claims import ArrayClaim, check_attributes
+from flowlab.text import cut
 
 _DATA = {"data/state": 2, "data/action": 2, "data/point_cloud": 3}
 """Arrays with a row for each step, and how many dimensions they have."""
@@ -36,6 +40,7 @@ class DP3Store:
         self.task = Path(os.path.abspath(self.path)).stem
         """A store does not say which task it shows; its folder usually does."""
         group = self._open_group()
+        self._claims = {name: self._claim(name) for name in (*_DATA, _ENDS)}
         self._arrays = {name: self._open(group, name) for name in (*_DATA, _ENDS)}
         self._check_shapes()
         self._ends = self._read_ends()
@@ -110,40 +115,53 @@ class DP3Store:
 
     def _read(self, name: str, start: int, stop: int) -> np.ndarray:
         """Rows of an array; a damaged chunk is a :class:`DataError`."""
+        array = self._arrays[name]
+        size = (stop - start) * math.prod(array.shape[1:]) * array.dtype.itemsize
+        if size > MAX_LOADED_BYTES:
+            raise DataError(
+                f"{self.path}/{name}: rows {start} to {stop} have {size:,} bytes, expected at most {MAX_LOADED_BYTES:,}"
+            )
+        self._claims[name].check_chunks(start, stop)
         try:
-            return np.asarray(self._arrays[name][start:stop])
-        except (ValueError, RuntimeError, OSError) as error:
+            return np.asarray(array[start:stop])
+        except Exception as error:  # zarr and the codecs raise many kinds
             raise DataError(f"{self.path}/{name}: damaged ({first_line(error)}); {_REDO}") from error
 
     def _open_group(self) -> zarr.Group:
         """The group of the store."""
+        check_attributes(self.path)
         try:
-            return zarr.open_group(self.path, mode="r", zarr_format=2)
+            return zarr.open_group(self.path, mode="r", zarr_format=2, use_consolidated=False)
         except FileNotFoundError as error:
             raise DataError(f"{self.path}: there is no zarr v2 store here") from error
-        except (ValueError, OSError) as error:
+        except Exception as error:  # zarr lets through what the metadata lead it to
             raise DataError(f"{self.path}: not a readable zarr v2 store ({first_line(error)}); {_REDO}") from error
 
     def _open(self, group: zarr.Group, name: str) -> "zarr.Array[Any]":
         """An array, its values unread."""
         try:
             array = group[name]
-        except KeyError as error:
-            raise DataError(
-                f"{self.path}: the array {name} is missing, there are: {', '.join(self._existing()) or 'none'}; "
-                f"a store in DP3's layout has {', '.join((*_DATA, _ENDS))}"
-            ) from error
-        except (ValueError, TypeError, OSError) as error:
+        except Exception as error:  # zarr lets through what the metadata lead it to
             raise DataError(f"{self.path}/{name}: damaged ({first_line(error)}); {_REDO}") from error
         if not isinstance(array, zarr.Array):
             raise DataError(f"{self.path}/{name}: a group, expected an array")
-        if array.dtype.kind not in "fiu":
-            raise DataError(f"{self.path}/{name}: values of type {array.dtype}, expected numbers")
         return array
+
+    def _claim(self, name: str) -> ArrayClaim:
+        """What an array claims; all that can be told without zarr is checked."""
+        folder = self.path / name
+        if not (folder / ".zarray").exists():
+            if (folder / ".zgroup").exists():
+                raise DataError(f"{folder}: a group, expected an array")
+            raise DataError(
+                f"{self.path}: the array {name} is missing, there are: {', '.join(self._existing()) or 'none'}; "
+                f"a store in DP3's layout has {', '.join((*_DATA, _ENDS))}"
+            )
+        return ArrayClaim.read(folder)
 
     def _existing(self) -> list[str]:
         """The arrays that the store has, as far as folders tell."""
-        return sorted(str(f.parent.relative_to(self.path)) for f in self.path.glob("*/*/.zarray"))
+        return sorted(cut(str(f.parent.relative_to(self.path))) for f in self.path.glob("*/*/.zarray"))
 
     def _check_shapes(self) -> None:
         """Refuse arrays that are not of one set of steps."""

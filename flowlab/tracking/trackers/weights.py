@@ -5,7 +5,7 @@ import http.client
 import logging
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
@@ -16,8 +16,11 @@ from jaxtyping import Float32
 from pydantic import FilePath
 
 from flowlab.errors import FlowlabError, MissingLibraryError
+from flowlab.limits import MAX_WEIGHTS_BYTES
 from flowlab.records import Clip, Tracks2D
+from flowlab.text import cut
 from flowlab.tracking.base import Session, Tracker
+from flowlab.untrusted import check_regular
 
 _LOG = logging.getLogger(__name__)
 
@@ -124,7 +127,10 @@ def read_weights(file: Path) -> Any:
     """
     import torch
 
+    check_regular(file, MAX_WEIGHTS_BYTES)
     values = torch.load(file, map_location="cpu", weights_only=True)
+    if not isinstance(values, Mapping):
+        raise ValueError(f"holds {type(values).__name__}, expected tensors by name")
     return values.get("model", values.get("state_dict", values))
 
 
@@ -178,5 +184,4 @@ def _sha256(file: Path) -> str:
 
 def _brief(error: Exception) -> str:
     """The start of a message, on one line."""
-    words = " ".join(str(error).split()) or type(error).__name__
-    return words if len(words) < 160 else words[:160] + " …"
+    return cut(" ".join(str(error).split()), 160) or type(error).__name__
