@@ -2,13 +2,14 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from flowlab.errors import DataError
 
-_KEY = "sha256"
+CHECKSUM = "sha256"
+"""Key under which JSON values tell their checksum."""
 
 
 def sha256_of(path: Path) -> str:
@@ -17,24 +18,25 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON values, and the SHA-256 of them all as ``sha256``."""
-    return {**values, _KEY: _checksum(values)}
+def with_checksum(values: Mapping[str, Any], free: Sequence[str] = ()) -> dict[str, Any]:
+    """JSON values, and the SHA-256 of them all as ``sha256``, but for the keys ``free``, which people may change."""
+    return {**values, CHECKSUM: json_checksum(values, free)}
 
 
-def without_checksum(values: Any, path: Path, advice: str) -> Any:
+def without_checksum(values: Any, where: Path | str, advice: str, free: Sequence[str] = ()) -> Any:
     """The values of a JSON file without their checksum, which files of earlier versions lack.
 
     Raises:
         DataError: They are not what was written.
     """
-    if not isinstance(values, dict) or _KEY not in values:
+    if not isinstance(values, dict) or CHECKSUM not in values:
         return values
-    rest = {key: value for key, value in values.items() if key != _KEY}
-    if values[_KEY] != _checksum(rest):
-        raise DataError(f"{path}: damaged (its content does not match its checksum); {advice}")
-    return rest
+    if values[CHECKSUM] != json_checksum(values, free):
+        raise DataError(f"{where}: damaged (its content does not match its checksum); {advice}")
+    return {key: value for key, value in values.items() if key != CHECKSUM}
 
 
-def _checksum(values: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+def json_checksum(values: Mapping[str, Any], free: Sequence[str] = ()) -> str:
+    """The SHA-256 of JSON values, but for the keys ``free`` and a checksum of theirs."""
+    counted = {key: value for key, value in values.items() if key not in (*free, CHECKSUM)}
+    return hashlib.sha256(json.dumps(counted, sort_keys=True).encode()).hexdigest()

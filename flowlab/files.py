@@ -110,6 +110,16 @@ def told_when_unwritable(path: Path, advice: str = "choose another place") -> It
         raise DataError(f"{path}: cannot be written ({error.strerror or error}); {advice}") from error
 
 
+def check_inside(folder: Path, path: Path) -> None:
+    """Refuse to write below ``folder`` where a link, which a stranger may have made, leads out of it.
+
+    Raises:
+        DataError: ``path`` is somewhere else.
+    """
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise DataError(f"{path}: is a link that leads out of {folder}, expected a folder; nothing is written there")
+
+
 def sync_folder(folder: Path) -> None:
     """Have the names in a folder on the disk, as far as its file system can."""
     with suppress(OSError):

@@ -34,3 +34,5 @@ MAX_CALIBRATION_BYTES = 1 << 20
 """Of a pickled calibration: a matrix of 16 numbers for each of some cameras."""
 MAX_SHOWN = 200
 """Characters of a value that an error shows."""
+MAX_WIDTH = 100_000
+"""Numbers of a state or an action."""

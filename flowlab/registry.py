@@ -5,9 +5,13 @@ offers is named by its import path, ``module:Class``.
 """
 
 import importlib
+import importlib.util
+import os
 import sys
-from collections.abc import Iterator
+import sysconfig
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -16,6 +20,7 @@ from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from flowlab.errors import UsageError, first_line, unknown_name
+from flowlab.text import cut
 
 T = TypeVar("T")
 
@@ -61,7 +66,7 @@ class Registry(Generic[T]):
         return ""
 
     def load(self, name: str, folder: Path | None = None) -> type[T]:
-        """The class of that name, or at that import path ``module:Class``.
+        """The class of that name, or at that import path ``module:Class``; see :func:`names_from_file`, too.
 
         Args:
             name: An installed name, with hyphens or underscores, or an import path.
@@ -111,6 +116,12 @@ class Registry(Generic[T]):
         package = module.partition(".")[0]
         _forget_others(package, folder)
         with _looked_at_last(folder):
+            if not _may_import(place, module, folder):
+                raise UsageError(
+                    f"{self.kind} '{cut(place)}': is named by a file, which may be a stranger's, so it is not imported "
+                    f"from what is installed; where you trust it, put the folder of its module on PYTHONPATH, or offer "
+                    f"it under the entry points {self.group}"
+                )
             try:
                 imported = importlib.import_module(module)
                 _remember(package, imported, folder)
@@ -129,6 +140,51 @@ EXPORTERS: Registry[Any] = Registry("exporters", "exporter", "flowlab.storage.ex
 ENGINES: Registry[Any] = Registry("engines", "engine", "flowlab.engines.base:Engine")
 LOGGERS: Registry[Any] = Registry("loggers", "logger", "flowlab.training.loggers:MetricsLogger")
 REGISTRIES = (TRACKERS, READERS, STAGES, POLICIES, EXPORTERS, ENGINES, LOGGERS)
+
+
+_named_by_user: ContextVar[Collection[str] | None] = ContextVar("_named_by_user", default=None)
+"""What the user has typed, where other names are those of a file; None where all are the user's."""
+
+
+@contextmanager
+def names_from_file(but: Collection[str] = ()) -> Iterator[None]:
+    """Within it, import paths are taken to come from a file that somebody else may have written.
+
+    Then a module is imported only if the user has put its folder on ``PYTHONPATH``, or it lies in the folder that is
+    given with the name; what is imported already is taken as it is. Nothing else that is installed runs for its name.
+
+    Args:
+        but: Import paths that the user has typed beside the file.
+    """
+    before = _named_by_user.set(but)
+    try:
+        yield
+    finally:
+        _named_by_user.reset(before)
+
+
+def _may_import(place: str, module: str, folder: Path | None) -> bool:
+    """Whether a module may be imported for that name."""
+    named, top = _named_by_user.get(), module.partition(".")[0]
+    if named is None or place in named or module in sys.modules or top == "flowlab":
+        return True
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):  # a name that is none, say: importing it tells what is wrong
+        return True
+    if spec is None:
+        return True
+    files = [spec.origin] if spec.has_location and spec.origin else list(spec.submodule_search_locations or ())
+    depth = 1 if spec.has_location and spec.submodule_search_locations else 0  # of a package it is its __init__
+    own = {p.resolve() for p in (*_on_pythonpath(), *([] if folder is None else [folder]))}
+    return bool(files) and all(Path(f).resolve().parents[depth] in own for f in files)
+
+
+def _on_pythonpath() -> list[Path]:
+    """Folders that the user has named, but for those of Python and of installed packages."""
+    installed = {Path(p).resolve() for p in sysconfig.get_paths().values()}
+    folders = [Path(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
+    return [p for p in folders if p.resolve() not in installed and p.name not in ("site-packages", "dist-packages")]
 
 
 def registry_of(family: str) -> Registry[Any]:

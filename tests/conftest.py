@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +15,15 @@ from flowlab.records import Episode
 
 settings.register_profile("flowlab", max_examples=examples(100), deadline=None)
 settings.load_profile("flowlab")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Decoded datasets of tests lie in a cache of their own, in other processes too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FLOWLAB_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
 
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -58,8 +58,9 @@ def make_run(*arguments: str | Path) -> Path:
 
 
 def lines_of(run: Path, kind: str | None = None) -> list[dict[str, Any]]:
-    """Lines of ``metrics.jsonl``, of one kind or of all."""
+    """Lines of ``metrics.jsonl`` without their digests, of one kind or of all."""
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert all(line.pop("sha256") for line in lines)
     return [line for line in lines if kind in (None, line["kind"])]
 
 
@@ -91,6 +92,11 @@ def header_of(path: Path) -> dict[str, Any]:
     ends = [about["data_offsets"][1] for name, about in header.items() if name != "__metadata__"]
     assert 8 + length + max(ends) == len(content)
     return header
+
+
+def step_in(path: Path) -> int:
+    """The training step that a file of weights says it is of."""
+    return int(json.loads(header_of(path)["__metadata__"]["flowlab"])["step"])
 
 
 def leftovers(folder: Path) -> list[str]:

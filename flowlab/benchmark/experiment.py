@@ -17,7 +17,8 @@ from flowlab.evaluation.evaluate import evaluate_here
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
-from flowlab.policies.checkpoint import RUN, newest_checkpoint, read_run_config, read_trained, step_of
+from flowlab.policies.checkpoint import newest_checkpoint, read_run_config, read_trained, step_of
+from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
 from flowlab.training import run
 
@@ -107,15 +108,11 @@ def _run_units(
 
 def _train(data: Path, folder: Path, settings: TrainSettings, device: str) -> None:
     """Train to the end, from wherever an earlier try has come to."""
-    if not (folder / RUN).exists():
-        trainer = run.prepare_run(data, folder, settings, run.ComputeSettings(device=device))
+    POLICIES.load(settings.policy)  # the experiment names it, not only the run
+    if not _finished(folder):
+        run.run(run.begin_run(data, folder, settings, run.ComputeSettings(device=device)), lambda _: None)
     else:
-        found = json.loads(read_trained(folder).policy.settings.model_dump_json())
-        _check_same(found, settings, folder)
-        if _finished(folder):
-            return
-        trainer = run.resume_run(folder)
-    run.run(trainer, lambda _: None)
+        _check_same(json.loads(read_trained(folder).policy.settings.model_dump_json()), settings, folder)
 
 
 def _finished(folder: Path) -> bool:

@@ -8,6 +8,7 @@ from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
 from flowlab.config import Settings, explain, read_named
 from flowlab.errors import UsageError, unknown_name
 from flowlab.evaluation.trials import Trial, list_trials
+from flowlab.registry import POLICIES, names_from_file
 from flowlab.sim.tasks import tasks_named
 from flowlab.untrusted import parse_yaml
 
@@ -66,9 +67,14 @@ def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
     if not isinstance(values, dict):
         raise UsageError(f"experiment {name}: is a mapping with the keys {', '.join(ExperimentRecipe.model_fields)}")
     try:
-        return ExperimentRecipe.model_validate({**values, **changes})
+        recipe = ExperimentRecipe.model_validate({**values, **changes})
     except ValidationError as error:
         raise UsageError(f"experiment {name}: {explain(error, ExperimentRecipe)}") from error
+    with names_from_file(but=changes.get("policies", ())):
+        for policy in (*recipe.policies, *(v.policy for v in recipe.variants)):
+            if ":" in policy:
+                POLICIES.load(policy)
+    return recipe
 
 
 def with_variants(recipe: ExperimentRecipe, names: Sequence[str]) -> ExperimentRecipe:

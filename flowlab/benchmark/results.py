@@ -7,15 +7,17 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from flowlab.benchmark.migrations import migrate_result
+from flowlab.checksums import with_checksum, without_checksum
 from flowlab.config import explain
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import read_evaluations
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
-from flowlab.files import write_atomically
+from flowlab.files import remove_leftovers, told_when_unwritable, write_atomically
 from flowlab.policies.checkpoint import read_trained
 from flowlab.untrusted import read_json
 
+_ADVICE = "restore it, or delete it and the experiment does it again"
 UNITS = "units"
 """Folder of an experiment that holds its results."""
 
@@ -27,9 +29,11 @@ def unit_path(experiment: Path, name: str) -> Path:
 
 def write_result(path: Path, result: PolicyResult) -> None:
     """Write a result as JSON, in one step. Every episode is a line of its own."""
-    text = json.dumps(result.model_dump(mode="json", exclude_defaults=True))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text.replace(' {"task":', '\n{"task":').replace('[{"task":', '[\n{"task":') + "\n")
+    text = json.dumps(with_checksum(result.model_dump(mode="json", exclude_defaults=True)))
+    with told_when_unwritable(path, "make room, then give the same command again"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
+        write_atomically(path, text.replace(' {"task":', '\n{"task":').replace('[{"task":', '[\n{"task":') + "\n")
 
 
 def read_result(path: Path) -> PolicyResult:
@@ -38,12 +42,11 @@ def read_result(path: Path) -> PolicyResult:
     Raises:
         DataError: The file is damaged.
     """
+    values = without_checksum(read_json(path, _ADVICE), str(path), _ADVICE)
     try:
-        return PolicyResult.model_validate(migrate_result(read_json(path)))
+        return PolicyResult.model_validate(migrate_result(values))
     except ValidationError as error:
-        raise DataError(
-            f"{path}: {explain(error, PolicyResult)}; restore it, or delete it and the experiment does it again"
-        ) from error
+        raise DataError(f"{path}: {explain(error, PolicyResult)}; {_ADVICE}") from error
 
 
 def read_results(folders: Sequence[Path]) -> list[PolicyResult]:
@@ -56,7 +59,7 @@ def read_results(folders: Sequence[Path]) -> list[PolicyResult]:
 
 def read_experiment(out: Path) -> list[PolicyResult]:
     """All results of an experiment. Raises :class:`DataError` where there is none yet."""
-    found = sorted((out / UNITS).glob("*.json"))
+    found = sorted(p for p in (out / UNITS).glob("*.json") if not p.name.startswith("."))
     if not found:
         raise DataError(f"{out}: no unit of the experiment is done yet; 'flowlab bench --out {out}' goes on with it")
     return [read_result(path) for path in found]

@@ -22,7 +22,7 @@ _COMMANDS = {
     "report": ("flowlab.cli.report:report", "Write a report of evaluations, beside the paper's numbers."),
     "grade": ("flowlab.cli.grade:grade", "Measure the error of estimated tracks against known ones."),
     "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
-    "validate": ("flowlab.cli.datasets:validate", "Check a dataset for everything that would spoil training."),
+    "validate": ("flowlab.cli.datasets:validate", "Check a dataset or a run for all that would spoil its use."),
     "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording, a film or a PNG."),
     "export": ("flowlab.cli.datasets:export", "Write a dataset in another tool's layout."),
     "plugins": ("flowlab.cli.plugins:plugins", "List trackers, readers, stages, policies and more, and from where."),
@@ -60,8 +60,7 @@ class _Commands(click.Group):
     cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 data invalid; 4 some units failed; 130 interrupted. "
-    "An extraction that ended early, for whatever reason, goes on when the same command is given again; a training "
-    "run, with --resume.",
+    "What ended early, for whatever reason, goes on when the same command is given again.",
 )
 @click.version_option(__version__)
 def cli() -> None:

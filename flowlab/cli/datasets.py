@@ -1,12 +1,17 @@
 """``flowlab info``, ``flowlab validate`` and ``flowlab export``."""
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from flowlab.cli.console import echo, print_json, print_table
 from flowlab.errors import DataError
+
+if TYPE_CHECKING:
+    from flowlab.storage.validation import Finding
 
 
 @click.command()
@@ -64,23 +69,41 @@ def _numbers(values: list[float]) -> str:
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def validate(dataset: Path, as_json: bool) -> None:
-    """Check a dataset: one line for each finding, exit code 3 if there is any."""
-    from flowlab.storage.validation import validate as findings_of
-
+def validate(folder: Path, as_json: bool) -> None:
+    """Check a dataset or a training run: one line for each finding, exit code 3 if there is any."""
     findings = []
-    for finding in findings_of(dataset):
+    for finding in _findings_of(folder):
         findings.append(finding)
         if not as_json:
             echo(str(finding))
     if as_json:
         print_json([{"file": f.place, "problem": f.problem} for f in findings])
     if findings:
-        raise DataError(f"{dataset}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
+        raise DataError(f"{folder}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
     if not as_json:
-        echo(f"{dataset}: sound")
+        echo(f"{folder}: sound{_reservation(folder)}")
+
+
+def _findings_of(folder: Path) -> "Iterator[Finding]":
+    """What is wrong with a dataset or a run."""
+    if any((folder / name).exists() for name in ("policy.json", "run.json")):
+        from flowlab.evaluation.validation import validate_run
+
+        return validate_run(folder)
+    from flowlab.storage.validation import validate
+
+    return validate(folder)
+
+
+def _reservation(folder: Path) -> str:
+    """What checking cannot tell, to be added to what is sound."""
+    if not (folder / "policy.json").exists():
+        return ""
+    from flowlab.evaluation.validation import has_checksums
+
+    return "" if has_checksums(folder) else "; of an earlier version, without checksums: a changed number is not found"
 
 
 @click.command()

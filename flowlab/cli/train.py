@@ -78,7 +78,7 @@ def train(
     --minutes is CPU time of one thread, so that what else the machine does changes nothing; on a GPU it is time by
     the clock. The learning rate falls to zero within it.
 
-    Ended early, a run goes on with --resume as if it had never stopped.
+    Ended early, a run goes on as if it had never stopped: by the same command, or with --resume.
     """
     if resume:
         given = {"--policy": policy, "--out": out, "--profile": profile, "--minutes": minutes, "--set": overrides,

@@ -7,6 +7,7 @@ import numpy as np
 from flowlab.config import Settings
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
+from flowlab.errors import DataError
 from flowlab.provenance import Channels
 
 _NEAR_M = 0.1
@@ -44,6 +45,12 @@ def infer_channels(source: TrainingSource, buffer: ReplayBuffer) -> ChannelSpec:
     """
     about = source.provenance
     if about.state is not None or about.action is not None:
+        for name, told, width in (("state", about.state, buffer.state.shape[1]),
+                                  ("action", about.action, buffer.action.shape[1])):  # fmt: skip
+            if any(not 0 <= k < width for c in told or () for k in c.index):
+                raise DataError(
+                    f"{source.path}: its provenance names a number of the {name} that is not there; each has {width}"
+                )
         return _as_stated(about.state or (), about.action or ())
     if about.kind != "recorded" or buffer.state.shape[1] < 3 or not _gripper_is_seen(buffer):
         return ChannelSpec()

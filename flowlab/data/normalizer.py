@@ -1,7 +1,6 @@
 """Numbers of a dataset brought to about [-1, 1] and back."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -12,8 +11,9 @@ from flowlab.config import Settings
 from flowlab.data.channels import ChannelSpec
 from flowlab.data.needs import FlowNeeds
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.source import TrainingSource
 from flowlab.data.training_settings import TrainSettings
+from flowlab.errors import DataError
+from flowlab.storage.stats import step_quantile
 
 _STILL = 1e-4
 """A channel that varies less than this is only centered, as in DP3."""
@@ -35,6 +35,11 @@ class Scale(Settings):
         unit = np.where(hi - lo < _STILL, 1.0, (hi - lo) / 2)
         return cls(offset=tuple(((lo + hi) / 2).tolist()), unit=tuple(unit.tolist()))
 
+    def fits(self, width: int) -> bool:
+        """Whether it is for so many channels, and can be undone."""
+        numbers = np.isfinite([*self.offset, *self.unit]).all() and all(u > 0 for u in self.unit)
+        return bool(len(self.offset) == len(self.unit) == width and numbers)
+
 
 class Normalizer(Settings):
     """The scales of a dataset. Lengths have one unit for all axes, so that shapes keep their proportions."""
@@ -49,24 +54,25 @@ class Normalizer(Settings):
     """Normalized flow is clipped here."""
 
 
-def fit_normalizer(
-    source: TrainingSource, buffer: ReplayBuffer, channels: ChannelSpec, settings: TrainSettings
-) -> Normalizer:
-    """The normalizer of a dataset, from the statistics gathered while it was written."""
-    arrays = source.statistics["arrays"]
-    low, high = np.array(arrays["point_cloud"]["min"]), np.array(arrays["point_cloud"]["max"])
+def fit_normalizer(buffer: ReplayBuffer, channels: ChannelSpec, settings: TrainSettings) -> Normalizer:
+    """The normalizer of demonstrations, from their numbers: what a dataset says of them may not be true of them.
+
+    Raises:
+        DataError: Some are no numbers.
+    """
+    low, high = _limits(buffer.point_cloud, "point_cloud")
     center, half = (low + high) / 2, float((high - low).max() / 2)
     relative = settings.relative_to_gripper and channels.gripper is not None
-    action = arrays["action"]["min"], arrays["action"]["max"]
+    action = _limits(buffer.action, "action")
     if relative and channels.action_position is not None:
         action = _relative_limits(buffer, channels, settings)
     scale = Scale.of_limits(*action)
     if settings.batch.turn_deg and channels.action_displacement is not None:
         scale = _isotropic(scale, action, channels.action_displacement)
-    flow, flow_clip = _flow_scale(source.statistics, settings.needs.flow)
+    flow, flow_clip = _flow_scale(buffer, settings.needs.flow)
     return Normalizer(
         position=Scale(offset=(0.0,) * 3 if relative else tuple(center.tolist()), unit=(half,) * 3),
-        state=Scale.of_limits(arrays["state"]["min"], arrays["state"]["max"]),
+        state=Scale.of_limits(*_limits(buffer.state, "state")),
         action=scale,
         flow=flow,
         flow_clip=flow_clip,
@@ -81,15 +87,33 @@ def _isotropic(scale: Scale, limits: tuple[Limits, Limits], channels: tuple[int,
     return Scale(offset=tuple(offset.tolist()), unit=tuple(unit.tolist()))
 
 
-def _flow_scale(statistics: Mapping[str, Any], needs: FlowNeeds | None) -> tuple[Scale | None, float | None]:
+def _limits(values: Float[np.ndarray, "F *N C"], name: str) -> tuple[Float[np.ndarray, "C"], Float[np.ndarray, "C"]]:
+    """Least and greatest value of every channel."""
+    rows = values.reshape(len(values), -1)  # long rows are looked at many times as fast as short ones
+    low, high = (limit.reshape(-1, values.shape[-1]) for limit in (rows.min(0), rows.max(0)))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise DataError(f"'{name}' has values that are not finite; 'flowlab validate' tells where")
+    return low.min(0).astype(float), high.max(0).astype(float)
+
+
+def _flow_scale(buffer: ReplayBuffer, needs: FlowNeeds | None) -> tuple[Scale | None, float | None]:
     """The scale of flow [m], and the greatest normalized value."""
     if needs is None:
         return None, None
-    flow = statistics["arrays"]["flow"]
-    unit, clip = max(*map(abs, flow["min"]), *map(abs, flow["max"]), _STILL), 1.0
+    unit, clip = max([_STILL, *(_largest(flow) for flow in _flows(buffer))]), 1.0
     if needs.scale == "quantile":
-        unit, clip = max(min(statistics["motion"]["step_m"]["p99"], unit), _STILL), needs.clip
+        unit, clip = max(min(step_quantile(_flows(buffer), 0.99), unit), _STILL), needs.clip
     return Scale(offset=(0.0,) * 3, unit=(unit,) * 3), clip
+
+
+def _largest(flow: Float[np.ndarray, "T Q 3"]) -> float:
+    (low,), (high,) = _limits(flow.reshape(-1, 1), "tracks")
+    return float(max(-low, high))
+
+
+def _flows(buffer: ReplayBuffer) -> Iterator[Float[np.ndarray, "T Q 3"]]:
+    """How query points move in each episode, step by step."""
+    return (np.diff(buffer.tracks[e.start : e.stop], axis=0) for e in buffer.episodes if len(e) > 1)
 
 
 def _relative_limits(

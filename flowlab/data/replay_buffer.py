@@ -73,13 +73,13 @@ class ReplayBuffer:
 
 
 def load_buffer(source: TrainingSource, fallback: Path, pictures: Sequence[str] = ()) -> ReplayBuffer:
-    """The demonstrations of a source, decoded into ``cache`` below it.
+    """The demonstrations of a source, decoded into the user's cache folder.
 
-    Decoded once for each content of the dataset; later calls only map the files.
+    Decoded once for each content; later calls look the files over and map them.
 
     Args:
         source: The dataset or store.
-        fallback: Folder that takes the cache where the dataset's own cannot be written.
+        fallback: Folder that takes the cache where the user's cannot be written.
         pictures: Which of ``rgb`` and ``depth`` are wanted; they are large, and decoded only on demand.
 
     Raises:

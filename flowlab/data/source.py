@@ -1,15 +1,14 @@
 """What can be trained on: a flowlab dataset, or a store in DP3's layout."""
 
-from collections.abc import Callable, Iterator, Mapping
+import hashlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from flowlab.arguments import check_path
 from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
-from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
@@ -23,9 +22,10 @@ class TrainingSource:
     fingerprint: str
     frames: int
     episodes: Callable[[], Iterator[Episode]]
-    statistics: Mapping[str, Any]
-    """As :func:`flowlab.storage.stats.describe` gives them."""
+    """Reads them all; what is not as the fingerprint says is a :class:`DataError`."""
     provenance: Provenance
+    cache_key: str
+    """Identifies what is read, the names of tasks too."""
 
 
 def open_training_source(path: Path) -> TrainingSource:
@@ -36,9 +36,9 @@ def open_training_source(path: Path) -> TrainingSource:
     """
     if DP3Store.looks_like(path):
         store = DP3Store(path)
-        described = stats.describe(stats.summarize(store.episodes()))
+        named = hashlib.sha256(f"{store.fingerprint} {store.task}".encode()).hexdigest()[:16]  # after the folder
         imported = Provenance(kind="imported")
-        return TrainingSource(path, store.fingerprint, sum(store.frames), store.episodes, described, imported)
+        return TrainingSource(path, store.fingerprint, sum(store.frames), store.episodes, imported, named)
     return source_of(Dataset(path))
 
 
@@ -69,5 +69,10 @@ def source_of(dataset: Dataset) -> TrainingSource:
         )
     frames = sum(ref.frames for ref in dataset.refs)
     return TrainingSource(
-        dataset.path, dataset.fingerprint, frames, dataset.episodes, dataset.stats, dataset.manifest.provenance
+        dataset.path,
+        dataset.fingerprint,
+        frames,
+        dataset.episodes,
+        dataset.provenance,
+        dataset.fingerprint,
     )

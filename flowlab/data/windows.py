@@ -53,7 +53,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         delta_timestamps: The same in seconds; give either. The rows must be evenly spaced in time.
         episodes: Which episodes, by their position in ``data``, in order of task and seed; None is all of them.
         tolerance_s: How far a time may be from that of a row [s].
-        cache: Folder for the decoded arrays where the dataset's own cannot be written.
+        cache: Folder for the decoded arrays where the user's cache folder cannot be written.
 
     Raises:
         UsageError: A key, an offset or an episode does not exist, or a time is that of no row.
@@ -72,11 +72,11 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
     ) -> None:
         asked = one_of(offsets, delta_timestamps)
         source, among = _opened(data)
-        fallback = source.path if cache is None else Path(cache)
+        fallback = None if cache is None else Path(cache)
         self.path = source.path
-        self._statistics = source.statistics["arrays"]
         self._folders = [cached_part(source, fallback, ARRAYS, arrays_of)]
         every, arrays = open_part(self._folders[0])
+        self._all_ends = sorted(e["stop"] for e in every)
         self._find_pictures(source, fallback, asked)
         self.keys = self._known(arrays, source)
         """Names of everything that can be asked for."""
@@ -142,14 +142,8 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
     def stats(self) -> dict[str, dict[str, Tensor]]:
         """``min``, ``max``, ``mean`` and ``std`` of every key that is asked for and is no yes or no, over all episodes
         of the dataset: per channel, so of shape (3,) for clouds, and of pictures as they are handed out."""
-        found = {}
-        for key in self.offsets:
-            if key in self._statistics:
-                about = self._statistics[key]
-                found[key] = {n: torch.tensor(about[n]).float() for n in ("min", "max", "mean", "std")}
-            elif self._arrays[key].dtype != bool:
-                found[key] = describe_rows(key, self._arrays[key])
-        return found
+        about = {k: self._arrays["tracks" if k == "flow" else k] for k in self.offsets}
+        return {k: describe_rows(k, values, self._all_ends) for k, values in about.items() if values.dtype != bool}
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
@@ -164,7 +158,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
             return values.permute(0, 3, 1, 2).float() / 255
         return values[:, None] if key == "depth" else values
 
-    def _find_pictures(self, source: TrainingSource, fallback: Path, asked: Mapping[str, Any]) -> None:
+    def _find_pictures(self, source: TrainingSource, fallback: Path | None, asked: Mapping[str, Any]) -> None:
         """Decode the pictures that are asked for."""
         for name in PICTURES:
             if name in asked:

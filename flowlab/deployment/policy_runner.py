@@ -1,12 +1,16 @@
 """A policy's side of one episode: what it remembers, and what it has decided to do."""
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
+from pydantic import ValidationError
 
+from flowlab.config import Settings, explain
 from flowlab.data.batches import ObservationBatch
 from flowlab.errors import DataError, UsageError
 from flowlab.perception.observer import Observer, ObserverSettings
@@ -14,6 +18,7 @@ from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.policies.base import ActionPlan, PolicySpec
 from flowlab.records import Frame, Queries
 
+Model = TypeVar("Model", bound=Settings)
 _NO_POINTS = np.zeros((0, 3), np.float32)
 
 
@@ -48,7 +53,8 @@ class PolicyRunner:
         """Where the noise of this episode's plans comes from."""
         self.queries: Queries | None = None
         """The points whose motion is predicted; None for policies that predict none."""
-        self._observer = Observer(ObserverSettings.model_validate(spec.observer or {}), task)
+        self._observer = Observer(_settings(ObserverSettings, spec.observer or {}, "observer"), task)
+        self._query_settings = _settings(QuerySettings, spec.queries, "queries") if needs.flow is not None else None
         self._task = torch.tensor([spec.tasks.index(task)])
         self._history: deque[_ObservedStep] = deque(maxlen=s.n_obs_steps)
         self._actions: deque[np.ndarray] = deque()
@@ -91,8 +97,8 @@ class PolicyRunner:
             cloud = self._observer.cloud(frame)
             if needs.point_cloud is not None:
                 points = self._observer.sample(cloud).points_world[: needs.point_cloud.points]
-            if first and needs.flow is not None:
-                self.queries = queries_in(cloud, frame.depth, QuerySettings.model_validate(self.spec.queries))
+            if first and self._query_settings is not None:
+                self.queries = queries_in(cloud, frame.depth, self._query_settings)
         rgb = frame.rgb if needs.rgb and frame is not None else None
         depth = frame.depth if needs.depth and frame is not None else None
         step = _ObservedStep(points, np.asarray(state, np.float32), rgb, depth)
@@ -121,3 +127,11 @@ class PolicyRunner:
     def next_action(self) -> Float32[np.ndarray, "A"]:
         """The action of this step, in the dataset's units."""
         return self._actions.popleft()
+
+
+def _settings(model: type[Model], values: Mapping[str, Any], name: str) -> Model:
+    """Settings that a policy was trained with. Raises :class:`DataError` where they are none."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise DataError(f"the policy's {name}: {explain(error, model)}; restore its policy.json") from error

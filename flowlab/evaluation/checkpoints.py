@@ -1,18 +1,23 @@
 """Checkpoints to be evaluated, and what is kept of their evaluations in the run's folder."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
+from flowlab.config import explain
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.evaluation.episode_log import EPISODES, read_results
 from flowlab.evaluation.results import CheckpointEvaluation
 from flowlab.evaluation.trials import Trial
-from flowlab.policies.checkpoint import CHECKPOINTS, TrainedPolicy, newest_checkpoint, read_trained, step_of
+from flowlab.policies.checkpoint import CHECKPOINTS, POLICY, TrainedPolicy, newest_checkpoint, read_trained, step_of
 from flowlab.sim.scene_settings import SceneSettings
 
 FOLDER = "evaluation"
 """Of a run: holds a folder for every checkpoint and number of executed steps."""
+_FOLDER_NAME = re.compile(r"step-(\d{1,18})-execute-(\d{1,9})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +40,10 @@ class CheckpointRef:
     def scene(self) -> SceneSettings:
         """The simulated scene that its policy knows, with color where the policy needs it."""
         color = self.trained.policy.settings.needs.rgb
-        return SceneSettings.model_validate(self.trained.scene).model_copy(update={"rgb": color})
+        try:
+            return SceneSettings.model_validate(self.trained.scene).model_copy(update={"rgb": color})
+        except ValidationError as error:
+            raise DataError(f"{self.run / POLICY}: scene: {explain(error, SceneSettings)}") from error
 
     def read_evaluation(self, trials: Sequence[Trial]) -> CheckpointEvaluation:
         """Those of the trials that have been tried."""
@@ -72,7 +80,10 @@ def find_checkpoint(path: Path, n_action_steps: int | None = None) -> Checkpoint
     most = s.horizon - s.n_obs_steps + 1
     if n_action_steps is not None and not 1 <= n_action_steps <= most:
         raise UsageError(f"--execute {n_action_steps}: {path} plans {most} steps ahead, so execute 1 to {most}")
-    return CheckpointRef(run, weights, step_of(weights), n_action_steps or s.n_action_steps, trained)
+    step = step_of(weights)
+    if weights.name != f"step-{step:08d}.safetensors":
+        raise DataError(f"{weights}: holds the weights after {step} steps; call it step-{step:08d}.safetensors")
+    return CheckpointRef(run, weights, step, n_action_steps or s.n_action_steps, trained)
 
 
 def find_checkpoints(run: Path, n_action_steps: int | None = None) -> list[CheckpointRef]:
@@ -109,10 +120,10 @@ def read_evaluations(run: Path) -> list[CheckpointEvaluation]:
     """All that is kept of a run's evaluations, in order of steps."""
     found = []
     for folder in sorted((run / FOLDER).glob("step-*-execute-*")):
-        _, step, _, n_action_steps = folder.name.split("-")
+        if (name := _FOLDER_NAME.fullmatch(folder.name)) is None:  # not ours
+            continue
+        step, n_action_steps = map(int, name.groups())
         outcomes = sorted(read_results(folder / EPISODES).values(), key=lambda o: o.trial)
         if outcomes:
-            found.append(
-                CheckpointEvaluation(step=int(step), n_action_steps=int(n_action_steps), outcomes=tuple(outcomes))
-            )
+            found.append(CheckpointEvaluation(step=step, n_action_steps=n_action_steps, outcomes=tuple(outcomes)))
     return found

@@ -1,24 +1,24 @@
 """``episodes.jsonl``: a line for every episode as it ends, so that an evaluation goes on where it was ended."""
 
-import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from pydantic import ValidationError
+
+from flowlab.config import explain
 from flowlab.errors import DataError
 from flowlab.evaluation.migrations import migrate_episode
 from flowlab.evaluation.results import EpisodeResult
 from flowlab.evaluation.trials import Trial
-from flowlab.files import write_atomically
+from flowlab.json_lines import append_line, read_lines
 
 EPISODES = "episodes.jsonl"
+_ADVICE = "delete the line, and the episode is tried again"
+_UNWRITABLE = "what was kept before is whole; make room, then give the same command again"
 
 
 def append_result(path: Path, result: EpisodeResult) -> None:
-    """Add a line to a file, in one write, so that processes may share it."""
-    line = result.model_dump_json(exclude_defaults=True) + "\n"
-    with path.open("ab", buffering=0) as file:
-        file.write(line.encode())
+    """Add a line to a file that processes may share. Raises :class:`DataError` where it cannot be written."""
+    append_line(path, result.model_dump(mode="json", exclude_defaults=True), _UNWRITABLE)
 
 
 def read_results(path: Path) -> dict[Trial, EpisodeResult]:
@@ -29,25 +29,11 @@ def read_results(path: Path) -> dict[Trial, EpisodeResult]:
     Raises:
         DataError: A line is damaged.
     """
-    return {result.trial: result for result in _whole_lines(path)}
-
-
-def repair_tail(path: Path) -> None:
-    """Take off a last line that a kill cut off, so that others can be added."""
-    text = path.read_bytes() if path.exists() else b""
-    if text and not text.endswith(b"\n"):
-        write_atomically(path, text[: text.rfind(b"\n") + 1].decode())
-
-
-def _whole_lines(path: Path) -> Iterator[EpisodeResult]:
-    """The result of every line but one that a kill cut off."""
-    *whole, _ = (path.read_bytes() if path.exists() else b"").split(b"\n")
-    for number, line in enumerate(whole, 1):
+    found = {}
+    for number, values in read_lines(path, "how an episode went", _ADVICE):
         try:
-            values: Any = json.loads(line)
-            yield EpisodeResult.model_validate(migrate_episode(values))
-        except ValueError as error:  # pydantic's too
-            raise DataError(
-                f"{path}: line {number} is damaged (expected how an episode went, found "
-                f"{line[:60].decode(errors='replace')!r}); delete the line, and the episode is tried again"
-            ) from error
+            result = EpisodeResult.model_validate(migrate_episode(values))
+        except ValidationError as error:
+            raise DataError(f"{path}: line {number} is damaged ({explain(error, EpisodeResult)}); {_ADVICE}") from error
+        found[result.trial] = result
+    return found

@@ -11,13 +11,15 @@ from flowlab.config import Settings
 from flowlab.engines.base import StartEngine, core_count, engine_by_name
 from flowlab.errors import UnfinishedError, UsageError
 from flowlab.evaluation.checkpoints import CheckpointRef, common_tasks, find_checkpoint, find_checkpoints
-from flowlab.evaluation.episode_log import append_result, read_results, repair_tail
+from flowlab.evaluation.episode_log import append_result, read_results
 from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult
 from flowlab.evaluation.rollout import BATCH_SLOTS, SimulatorPool, roll_out
 from flowlab.evaluation.training_record import describe_run
 from flowlab.evaluation.trials import Trial, check_unseen, list_trials
+from flowlab.files import check_inside, remove_leftovers, told_when_unwritable
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
+from flowlab.registry import POLICIES
 from flowlab.sim.scene_settings import SceneSettings
 
 _LARGEST_BATCH = 40
@@ -29,6 +31,8 @@ Progress = Callable[[int, int], None]
 class EpisodeBatch(Settings):
     """Some episodes of one task for one policy: what a worker does at a time."""
 
+    policy: str
+    """Name or import path of its kind, which whoever asked for the evaluation has loaded."""
     weights: Path
     episodes: Path
     """The file that results are added to."""
@@ -134,6 +138,7 @@ def evaluate_here(checkpoint: CheckpointRef, trials: Sequence[Trial], device: st
 def run_batch(batch: EpisodeBatch) -> int:
     """A worker's part: try every episode, keep each result as it ends, and say how many there were."""
     torch.set_num_threads(1)
+    POLICIES.load(batch.policy)
     policy = _policy(batch.weights, batch.device)
     simulators = _simulators(batch.trials[0].task, batch.scene)
     known = read_results(batch.episodes)  # by a worker that died over this batch
@@ -175,8 +180,11 @@ def _missing_batches(
     checkpoint: CheckpointRef, trials: Sequence[Trial], parts: int, device: str
 ) -> Iterable[EpisodeBatch]:
     """Batches of the trials that have no result yet, at least ``parts`` of them if there are enough."""
-    checkpoint.episodes.parent.mkdir(parents=True, exist_ok=True)
-    repair_tail(checkpoint.episodes)
+    folder = checkpoint.episodes.parent
+    check_inside(checkpoint.run, checkpoint.episodes)
+    with told_when_unwritable(folder, "make room, or copy the run to where it can be written"):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(folder)
     known = read_results(checkpoint.episodes)
     todo = [t for t in trials if t not in known]
     rounds = -(-len(todo) // (parts * BATCH_SLOTS))  # every slot has as many episodes
@@ -185,6 +193,7 @@ def _missing_batches(
         of_task = [t for t in todo if t.task == task]
         for first in range(0, len(of_task), size):
             yield EpisodeBatch(
+                policy=checkpoint.trained.policy.settings.policy,
                 weights=checkpoint.weights,
                 episodes=checkpoint.episodes,
                 scene=checkpoint.scene,

@@ -1,15 +1,12 @@
 """How the policy of a run came about, from what the run has written."""
 
 import json
-import math
 import platform
 from collections.abc import Sequence
 from pathlib import Path
 
-from safetensors import safe_open
-
 from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult, TrainingRecord
-from flowlab.policies.checkpoint import newest_checkpoint, read_run_config, read_trained
+from flowlab.policies.checkpoint import count_weights, newest_checkpoint, read_run_config, read_trained
 from flowlab.training.metrics import METRICS, cpu_seconds_spent, last_metrics
 
 
@@ -22,7 +19,7 @@ def describe_training(run: Path) -> TrainingRecord:
         settings=json.loads(settings.model_dump_json()),
         steps=planned.steps,
         cpu_s=round(cpu_seconds_spent(run / METRICS), 1),
-        weights=_count_weights(newest_checkpoint(run)),
+        weights=count_weights(newest_checkpoint(run)),
         device=planned.device,
         precision=planned.precision,
         demonstrations=len(planned.train),
@@ -42,12 +39,6 @@ def describe_run(run: Path, evaluations: Sequence[CheckpointEvaluation]) -> Poli
         training=training,
         evaluations=tuple(sorted(evaluations, key=lambda e: e.step)),
     )
-
-
-def _count_weights(checkpoint: Path) -> int:
-    """How many numbers a checkpoint holds."""
-    with safe_open(checkpoint, "pt") as file:
-        return sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - no mapping
 
 
 def _processor() -> str:

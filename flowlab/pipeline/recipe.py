@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, SerializeAsAny, ValidationError, Valida
 from flowlab.config import Settings, explain, override, read_named, set_value
 from flowlab.errors import UsageError
 from flowlab.pipeline.stage import Pipeline, Stage
-from flowlab.registry import STAGES
+from flowlab.registry import STAGES, names_from_file
 from flowlab.untrusted import parse_yaml
 
 _EXAMPLE = "observer.points=512"
@@ -71,8 +71,12 @@ def load_recipe(name: "str | Recipe", overrides: Iterable[str] = ()) -> Recipe:
     """
     if isinstance(name, Recipe):
         return parse_recipe(name.model_dump_json(), name.name, overrides, name.folder)
-    path = Path(name)
-    return parse_recipe(read_named("recipe", name), name, overrides, path.parent if path.suffix else None)
+    path, overrides = Path(name), [*overrides]
+    text = read_named("recipe", name)
+    if not path.suffix:
+        return parse_recipe(text, name, overrides)
+    with names_from_file(but=[change.partition("=")[2] for change in overrides]):
+        return parse_recipe(text, name, overrides, path.parent)
 
 
 def parse_recipe(text: str, origin: str, overrides: Iterable[str] = (), folder: Path | None = None) -> Recipe:

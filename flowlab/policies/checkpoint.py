@@ -1,9 +1,10 @@
 """A training run on disk: what a policy is (JSON), its weights (safetensors), and what resuming needs."""
 
+import hashlib
 import json
-import os
+import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,15 +16,18 @@ from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from flowlab.checksums import json_checksum, with_checksum, without_checksum
 from flowlab.config import Settings, explain
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
-from flowlab.errors import DataError, UsageError
-from flowlab.files import remove_leftovers, temporary_path, write_json
+from flowlab.errors import DataError, FlowlabError, UsageError, first_line
+from flowlab.files import check_inside, new_file, remove_leftovers, write_json
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
+from flowlab.registry import names_from_file
 from flowlab.storage.manifest import differences
-from flowlab.untrusted import read_json
+from flowlab.text import shown
+from flowlab.untrusted import parse_json, read_json
 from flowlab.version import __version__
 
 POLICY = "policy.json"
@@ -31,7 +35,14 @@ RUN = "run.json"
 RESUME = "resume.safetensors"
 CHECKPOINTS = "checkpoints"
 _ADVICE = "delete it to use the checkpoint before it"
+_RESTORE = "restore it from a copy, or train anew into another --out"
+_ABOUT = "flowlab"
+"""Key under which a file of tensors says what it is."""
+_FREE = ("dataset",)
+"""What people may change in ``run.json``: where the dataset is, whose content is checked."""
 Model = TypeVar("Model", bound=Settings)
+Groups = Mapping[str, Mapping[str, Tensor]]
+"""Tensors by group and name."""
 
 
 class TrainedPolicy(Settings):
@@ -80,6 +91,8 @@ class RunConfig(Settings):
     logs: tuple[str, ...]
     began_from: str | None
     """Checkpoint that the first weights are from."""
+    overfit: int | None = None
+    """How many demonstrations are trained on and validated on, where they are the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +121,26 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
     tensors, step = _read(weights, folder, _ADVICE)
-    policy = make_policy(trained.policy).requires_grad_(False).eval()
+    policy = build_policy(trained.policy, tensors, f"{weights}: does not fit {folder / POLICY}")
+    return LoadedPolicy(policy.requires_grad_(False).eval().to(device), trained, step, weights)
+
+
+def build_policy(spec: PolicySpec, tensors: Mapping[str, Tensor], misfit: str) -> PolicyNetwork:
+    """The policy of a spec with these weights. Raises :class:`DataError`, with ``misfit``, where they do not fit it.
+
+    That is told by their shapes before memory is taken for a network that may be of any size.
+    """
     try:
+        with suppress(NotImplementedError, TypeError), torch.device("meta"):  # some networks need real numbers
+            if {n: v.shape for n, v in make_policy(spec).state_dict().items()} != {
+                n: v.shape for n, v in tensors.items()
+            }:
+                raise DataError(f"{misfit}; restore both from one run")
+        policy = make_policy(spec)
         policy.load_state_dict(tensors)
     except RuntimeError as error:
-        raise DataError(f"{weights}: does not fit {folder / POLICY}; restore both from one run") from error
-    return LoadedPolicy(policy.to(device), trained, step, weights)
+        raise DataError(f"{misfit}; restore both from one run") from error
+    return policy
 
 
 def newest_checkpoint(run: Path) -> Path:
@@ -128,14 +155,23 @@ def newest_checkpoint(run: Path) -> Path:
 def step_of(weights: Path) -> int:
     """Training steps that a checkpoint has seen. Raises :class:`DataError` where it is damaged."""
     with _understood(weights, _ADVICE), safetensors.safe_open(weights, "pt") as file:
-        return int((file.metadata() or {})["step"])
+        return int(_metadata(file, str(weights), _ADVICE)["step"])
+
+
+def count_weights(weights: Path) -> int:
+    """How many numbers a checkpoint holds. Raises :class:`DataError` where it is damaged."""
+    with _understood(weights, _ADVICE), safetensors.safe_open(weights, "pt") as file:
+        return sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118 - no mapping
 
 
 def read_trained(folder: Path) -> TrainedPolicy:
     """``policy.json`` of a run."""
     path = folder / POLICY
     if not path.exists():
-        raise DataError(f"{folder}: not a training run (it has no {POLICY})")
+        raise DataError(
+            f"{folder}: not a training run (it has no {POLICY}); what a kill left of one begins again with the command "
+            "that began it"
+        )
     return _validated(TrainedPolicy, path)
 
 
@@ -144,7 +180,7 @@ def read_run_config(folder: Path) -> RunConfig:
     path = folder / RUN
     if not path.exists():
         raise DataError(f"{folder}: no run to resume (it has no {RUN}); start one with 'flowlab train DATASET --out'")
-    return _validated(RunConfig, path)
+    return _validated(RunConfig, path, _FREE)
 
 
 def check_observer(trained: TrainedPolicy, where: Path, source: TrainingSource) -> None:
@@ -170,23 +206,25 @@ def check_observer(trained: TrainedPolicy, where: Path, source: TrainingSource) 
 def save_weights(folder: Path, policy: PolicyNetwork, step: int) -> Path:
     """Keep the weights of a policy as a checkpoint of a run."""
     path = folder / CHECKPOINTS / f"step-{step:08d}.safetensors"
-    path.parent.mkdir(exist_ok=True)
-    remove_leftovers(path.parent)
-    _write(path, policy.state_dict(), step)
+    with writing_run(folder):
+        check_inside(folder, path.parent)
+        path.parent.mkdir(exist_ok=True)
+        remove_leftovers(path.parent)
+        _write(path, policy.state_dict(), {"step": step, "policy": _identity_in(folder / POLICY)})
     return path
 
 
-def save_resume(folder: Path, step: int, groups: Mapping[str, Mapping[str, Tensor]]) -> None:
+def save_resume(folder: Path, step: int, groups: Groups) -> None:
     """Keep everything that goes on changing: named groups of tensors, as they are after ``step`` steps."""
-    tensors = {f"{group}:{name}": value for group, values in groups.items() for name, value in values.items()}
-    _write(folder / RESUME, tensors, step)
+    with writing_run(folder):
+        _write_resume(folder, step, groups, _identity_in(folder / POLICY), _identity_in(folder / RUN))
 
 
-def read_resume(folder: Path) -> tuple[int, dict[str, dict[str, Tensor]]]:
+def read_resume(folder: Path) -> tuple[int, Groups]:
     """The step, and the groups of :func:`save_resume`."""
     path = folder / RESUME
     if not path.exists():
-        raise DataError(f"{folder}: nothing to resume (it has no {RESUME}); delete it and start anew")
+        raise DataError(f"{folder}: nothing to resume (it has no {RESUME}); start anew, into another --out")
     tensors, step = _read(path, folder, f"start anew; --from {folder} begins with its newest weights")
     groups: dict[str, dict[str, Tensor]] = {}
     for name, value in tensors.items():
@@ -196,38 +234,86 @@ def read_resume(folder: Path) -> tuple[int, dict[str, dict[str, Tensor]]]:
 
 
 @contextmanager
-def writing_run(folder: Path) -> Iterator[None]:
+def writing_run(folder: Path, advice: str | None = None) -> Iterator[None]:
     """Turns a failure to write into a sentence; what was there before is whole."""
     try:
         yield
+    except FlowlabError:
+        raise
     except (OSError, safetensors.SafetensorError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise DataError(
-            f"{folder}: cannot be written ({reason}); what was saved before is whole. Make room, then go on with "
-            f"'flowlab train {folder} --resume'"
-        ) from error
+        raise DataError(f"{folder}: cannot be written ({reason}); {advice or resume_advice(folder)}") from error
 
 
-def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig) -> None:
-    """Make the folder of a new run. Raises :class:`UsageError` where there is one already."""
-    if (folder / RUN).exists() or (folder / POLICY).exists():
+def resume_advice(folder: Path) -> str:
+    """What to do where a run cannot be written."""
+    return f"what was saved before is whole. Make room, then go on with 'flowlab train {folder} --resume'"
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a folder holds a run that can go on, or has come to its end; not what a kill left of a beginning."""
+    kept = (folder / RESUME).exists() or any((folder / CHECKPOINTS).glob("step-*.safetensors"))
+    return kept and (folder / POLICY).exists()
+
+
+def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig, groups: Groups) -> None:
+    """Make a new run of a folder: one that can be resumed, as soon as the last of its files is there.
+
+    Args:
+        folder: Where; what a kill left of an earlier beginning is replaced.
+        trained: What the policy is.
+        run: How the run goes.
+        groups: What goes on changing, as it is before the first step.
+
+    Raises:
+        UsageError: There is a run already.
+    """
+    if has_begun(folder):
         raise UsageError(
             f"{folder}: holds a run already; go on with 'flowlab train {folder} --resume', or choose another --out"
         )
-    with writing_run(folder):
+    if any((folder / CHECKPOINTS).glob("step-*")):
+        raise UsageError(f"{folder}: holds checkpoints, but no {POLICY} that says of what; choose another --out")
+    about = with_checksum(json.loads(trained.model_dump_json()))
+    plan = with_checksum(json.loads(run.model_dump_json()), _FREE)
+    with writing_run(folder, "nothing was begun. Make room, then give the same command again, or choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / POLICY, json.loads(trained.model_dump_json()))
-        write_json(folder / RUN, json.loads(run.model_dump_json()))
+        remove_leftovers(folder)
+        (folder / POLICY).unlink(missing_ok=True)
+        _write_resume(folder, 0, groups, _identity(about), _identity(plan))
+        write_json(folder / RUN, plan)
+        write_json(folder / POLICY, about)
 
 
-def _write(path: Path, tensors: Mapping[str, Tensor], step: int) -> None:
-    temporary = temporary_path(path)
-    try:
-        with writing_run(path.parent if path.name == RESUME else path.parents[1]):
-            save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, {"step": str(step)})
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _write_resume(folder: Path, step: int, groups: Groups, policy: str, run: str) -> None:
+    tensors = {f"{group}:{name}": value for group, values in groups.items() for name, value in values.items()}
+    _write(folder / RESUME, tensors, {"step": step, "policy": policy, "run": run})
+
+
+def _write(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
+    plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+    told = json.dumps(with_checksum({**about, "tensors": _digest(plain)}))
+    with new_file(path) as temporary:
+        save_file(plain, temporary, {_ABOUT: told})  # under one key: several would come in any order
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of tensors and their names."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        values = tensors[name]
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
+        digest.update(values.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _identity(values: Mapping[str, Any]) -> str:
+    """Identifies what ``policy.json`` or ``run.json`` says, wherever the dataset is, for the weights beside it."""
+    return json_checksum(values, _FREE)
+
+
+def _identity_in(path: Path) -> str:
+    return _identity(read_json(path, _RESTORE))
 
 
 def _read(path: Path, run: Path, advice: str) -> tuple[dict[str, Tensor], int]:
@@ -235,9 +321,23 @@ def _read(path: Path, run: Path, advice: str) -> tuple[dict[str, Tensor], int]:
     old = is_old(read_json(run / POLICY))
     with _understood(path, advice):
         with safetensors.safe_open(path, "pt") as file:
-            about = file.metadata() or {}
+            about = _metadata(file, str(path), advice)
         tensors, step = load_file(path), int(about["step"])
+    if "tensors" in about and _digest(tensors) != about["tensors"]:
+        raise DataError(f"{path}: damaged (its content does not match its checksum); {advice}")
+    for name, other in (("policy", run / POLICY), ("run", run / RUN)):
+        if name in about and about[name] != _identity_in(other):
+            raise DataError(f"{path}: was saved beside another {other.name} than {other}; restore both from one run")
     return {migrate_tensor(name) if old else name: value for name, value in tensors.items()}, step
+
+
+def _metadata(file: Any, where: str, advice: str) -> dict[str, Any]:
+    """What is said in a file of tensors; of one from an earlier version, its step. A :class:`KeyError` where flowlab
+    did not say it: a name that changed on disk must not pass for one that is left out."""
+    told: dict[str, str] = file.metadata() or {}
+    if told.keys() == {_ABOUT}:
+        return dict(without_checksum(parse_json(told[_ABOUT], where, advice), where, advice))
+    return {"step": told["step"]}
 
 
 @contextmanager
@@ -247,22 +347,27 @@ def _understood(path: Path, advice: str) -> Iterator[None]:
         raise DataError(f"{path}: there is no such checkpoint")
     try:
         yield
-    except KeyError as error:
-        raise DataError(f"{path}: not written by flowlab (it does not tell its step); {advice}") from error
+    except DataError:
+        raise
+    except (KeyError, ValueError) as error:
+        raise DataError(f"{path}: not written by flowlab, or damaged (it does not tell its step); {advice}") from error
     except (OSError, safetensors.SafetensorError) as error:
-        raise DataError(f"{path}: damaged ({error}); {advice}") from error
+        raise DataError(f"{path}: damaged ({first_line(error)}); {advice}") from error
 
 
-def _validated(model: type[Model], path: Path) -> Model:
-    values: Any = migrate_policy(read_json(path)) if model is TrainedPolicy else read_json(path)
-    found = values.get("format", FORMAT) if isinstance(values, dict) else None
-    if found != FORMAT:
-        raise DataError(f"{path}: format is {found}, this flowlab reads {FORMAT}; use the flowlab that wrote it")
+def _validated(model: type[Model], path: Path, free: tuple[str, ...] = ()) -> Model:
+    values: Any = read_json(path, _RESTORE)
+    found = values.get("format", 1) if isinstance(values, dict) and model is TrainedPolicy else FORMAT
+    if found not in (1, FORMAT):
+        raise DataError(f"{path}: format is {shown(found)}, this flowlab reads {FORMAT}; use the flowlab that wrote it")
+    values = without_checksum(values, str(path), _RESTORE, free)
+    values = migrate_policy(values) if model is TrainedPolicy else values
     try:
-        return model.model_validate(values)
+        with names_from_file():
+            return model.model_validate(values)
     except ValidationError as error:
         raise DataError(f"{path}: {explain(error, model)}") from error
     except UsageError as error:
-        told = isinstance(error.__cause__, ModuleNotFoundError)  # where such a module may lie
+        told = "PYTHONPATH" in str(error)  # where such a module may lie
         advice = "" if told else "; install what has this policy, or put its module's folder on PYTHONPATH"
         raise DataError(f"{path}: {error}{advice}") from error

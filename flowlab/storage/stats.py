@@ -144,8 +144,17 @@ def describe(summary: MergeableStats) -> dict[str, Any]:
     return about | ({"quality": _describe_quality(summary["quality"])} if "quality" in summary else {})
 
 
+def step_quantile(flows: Iterable[np.ndarray], q: float) -> float:
+    """The length [m] that so large a share of all steps (T, M, 3) stays below, as :func:`describe` tells it."""
+    return _quantile(np.sum([_count_steps(flow) for flow in flows], 0), q)
+
+
+def _count_steps(flow: np.ndarray) -> np.ndarray:
+    """How many steps are of what length."""
+    return np.histogram(np.linalg.norm(flow, axis=-1), _BINS)[0]
+
+
 def _of_episode(e: Episode) -> MergeableStats:
-    step = np.linalg.norm(e.flow[:-1], axis=-1)
     traveled = np.linalg.norm(e.tracks.xyz_world - e.tracks.xyz_world[0], axis=-1).max(0)
     arrays = {name: take(e) for name, take in _CHANNELS.items()}
     summary: MergeableStats = {
@@ -153,7 +162,7 @@ def _of_episode(e: Episode) -> MergeableStats:
         "frames": len(e),
         "points": traveled.size,
         "moving_points": int((traveled > MOVING_IN_EPISODE_M).sum()),
-        "steps": np.histogram(step, _BINS)[0].tolist(),
+        "steps": _count_steps(e.flow[:-1]).tolist(),
         "arrays": {name: _moments(a) for name, a in arrays.items() if a is not None and a.size},
     }
     if e.tracks.quality is not None:

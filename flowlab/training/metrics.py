@@ -1,12 +1,15 @@
 """What a run says of itself: ``metrics.jsonl``, and other places that are asked for."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from flowlab.files import write_atomically
+from flowlab.json_lines import append_line, line_of
+from flowlab.policies.checkpoint import resume_advice
 from flowlab.training.loggers import MetricsLogger
+from flowlab.viz.training_metrics import metrics_lines
 
 METRICS = "metrics.jsonl"
 
@@ -17,16 +20,15 @@ class MetricsFile:
     def __init__(self, folder: Path, step: int, logs: Sequence[MetricsLogger] = ()) -> None:
         self.path = folder / METRICS
         self._logs = logs
-        before = [line for line in _whole_lines(self.path) if json.loads(line)["step"] <= step] if step else []
-        write_atomically(self.path, "".join(line + "\n" for line in before))
-        spent = json.loads(before[-1]) if before else {"cpu_s": 0.0, "wall_s": 0.0}
-        self._began = time.process_time() - spent["cpu_s"], time.monotonic() - spent["wall_s"]
+        before = [line for line in metrics_lines(self.path) if line.step <= step] if step else []
+        write_atomically(self.path, b"".join(line_of(_values(x.kind, x.step, x.values)) for x in before))
+        spent = before[-1].values if before else {}
+        self._began = time.process_time() - spent.get("cpu_s", 0.0), time.monotonic() - spent.get("wall_s", 0.0)
 
     def write(self, kind: str, step: int, values: Mapping[str, float]) -> None:
         """Add a line of a kind (``train`` or ``validation``), with the CPU and clock time spent so far [s]."""
         spent = {"cpu_s": time.process_time() - self._began[0], "wall_s": time.monotonic() - self._began[1]}
-        with self.path.open("a") as file:
-            file.write(json.dumps({"kind": kind, "step": step, **values, **spent}) + "\n")
+        append_line(self.path, _values(kind, step, {**values, **spent}), resume_advice(self.path.parent))
         for log in self._logs:
             log.write(step, {f"{kind}/{name}": value for name, value in values.items()})
 
@@ -67,17 +69,15 @@ class RunningMeans:
 
 def last_metrics(path: Path, kind: str) -> dict[str, float]:
     """The newest line of a kind, without kind, step and time; empty where there is none."""
-    lines = [values for line in _whole_lines(path) if (values := json.loads(line))["kind"] == kind]
-    return {k: v for k, v in lines[-1].items() if k not in ("kind", "step", "cpu_s", "wall_s")} if lines else {}
+    lines = [line.values for line in metrics_lines(path) if line.kind == kind]
+    return {k: v for k, v in lines[-1].items() if k not in ("cpu_s", "wall_s")} if lines else {}
 
 
 def cpu_seconds_spent(path: Path) -> float:
     """CPU time up to the newest line [s]."""
-    lines = _whole_lines(path)
-    return float(json.loads(lines[-1])["cpu_s"]) if lines else 0.0
+    lines = metrics_lines(path)
+    return lines[-1].values.get("cpu_s", 0.0) if lines else 0.0
 
 
-def _whole_lines(path: Path) -> list[str]:
-    """Lines of the file; the last is left out where a kill cut it off."""
-    lines = path.read_text().split("\n") if path.exists() else []
-    return lines[:-1]
+def _values(kind: str, step: int, values: Mapping[str, float]) -> dict[str, Any]:
+    return {"kind": kind, "step": step, **values}

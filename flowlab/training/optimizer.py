@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ class Optimizers:
         """The moments of every weight, by name."""
         return {f"{key}/{name}": value for name, _, state in self._each() for key, value in state.items()}
 
-    def load_state(self, tensors: Tensors) -> None:
+    def load_state(self, tensors: Mapping[str, Tensor]) -> None:
         """Go on with the moments that :meth:`state` gave."""
         for name, (optimizer, parameter), _ in self._each():
             keys = ("step", "exp_avg", "exp_avg_sq")

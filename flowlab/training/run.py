@@ -1,6 +1,7 @@
 """A training run from beginning to end: started anew, from another's weights, or resumed."""
 
 import copy
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,19 +18,24 @@ from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError, UsageError
+from flowlab.files import remove_leftovers
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (
+    POLICY,
+    RUN,
     RunConfig,
     TrainedPolicy,
+    build_policy,
     check_observer,
+    has_begun,
     load_policy,
     read_resume,
     read_run_config,
     read_trained,
-    start_folder,
     writing_run,
 )
-from flowlab.registry import POLICIES
+from flowlab.registry import POLICIES, names_from_file
+from flowlab.storage.manifest import differences
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.loggers import check_loggers, make_logger
 from flowlab.training.metrics import MetricsFile
@@ -51,6 +57,28 @@ class ComputeSettings(Settings):
     """``auto`` is bf16 where the device has units for it."""
     logs: tuple[str, ...] = ()
     """Names of other places, see :func:`~flowlab.training.loggers.make_logger`."""
+
+
+def begin_run(
+    data: Path,
+    out: Path,
+    settings: TrainSettings,
+    compute: ComputeSettings,
+    *,
+    overfit: int | None = None,
+    began_from: Path | None = None,
+) -> Trainer:
+    """A new run; or, where the same call began it earlier, that run, as it was after the last step that was saved.
+
+    Arguments and errors are those of :func:`prepare_run` and :func:`resume_run`; a run that began with others is a
+    :class:`UsageError` that shows the difference.
+    """
+    if not has_begun(out):
+        return prepare_run(data, out, settings, compute, overfit=overfit, began_from=began_from)
+    _check_same(out, settings, overfit, began_from)
+    device = None if compute.device == "auto" else compute.device
+    precision = None if compute.precision == "auto" else compute.precision
+    return resume_run(out, data, device=device, threads=compute.threads, precision=precision, logs=compute.logs)
 
 
 def prepare_run(
@@ -95,20 +123,33 @@ def prepare_run(
         precision=processes.precision,
         logs=compute.logs,
         began_from=None if began_from is None else str(began_from),
+        overfit=overfit,
     )
     if settings.run.minutes is not None and settings.run.steps is None:
         steps = _fitting_steps(Trainer(out, planned, copy.deepcopy(policy), buffer, processes), settings.run.minutes)
         planned = planned.model_copy(update={"steps": processes.broadcast(steps)})
     trainer = Trainer(out, planned, policy, buffer, processes)
-    if processes.is_first:
-        start_folder(out, TrainedPolicy.now(policy.spec, source, buffer), planned)
-        trainer.save()
-    processes.wait()
+    trainer.begin(TrainedPolicy.now(policy.spec, source, buffer))
     return trainer
+
+
+def _check_same(out: Path, settings: TrainSettings, overfit: int | None, began_from: Path | None) -> None:
+    """Raises :class:`UsageError` where the run of a folder was begun in another way."""
+    began, trained = read_run_config(out), read_trained(out)
+    asked = {"overfit": overfit, "from": began_from and str(began_from)}
+    found = {"overfit": began.overfit, "from": began.began_from}
+    old, new = (json.loads(s.model_dump_json()) for s in (trained.policy.settings, settings))
+    owners = ("the run", "this command")
+    if lines := [*differences(found, asked, "run", owners=owners), *differences(old, new, "settings", owners=owners)]:
+        raise UsageError(
+            f"{out}: holds a run already, which began in another way; choose another --out, or go on with it by "
+            f"'flowlab train {out} --resume':\n  " + "\n  ".join(lines)
+        )
 
 
 def resume_run(
     folder: Path,
+    data: Path | None = None,
     *,
     device: str | None = None,
     threads: int | None = None,
@@ -116,16 +157,27 @@ def resume_run(
     logs: Sequence[str] | None = None,
 ) -> Trainer:
     """A run that ended early, as it was after the last step that was saved; it computes on what it did, but for what
-    is given.
+    is given. ``data`` is where its dataset is, if it has moved.
 
     Raises:
         DataError: The dataset is no longer what the run began with, or there is nothing to resume.
     """
-    began, trained = read_run_config(folder), read_trained(folder)
-    given = {"device": device, "threads": threads, "precision": precision, "logs": None if logs is None else (*logs,)}
+    trained, began = read_trained(folder), read_run_config(folder)
+    given = {
+        "dataset": None if data is None else data.resolve(),
+        "device": device,
+        "threads": threads,
+        "precision": precision,
+        "logs": None if logs is None else (*logs,),
+    }
     config = began.model_copy(update={k: v for k, v in given.items() if v is not None})
-    check_loggers(config.logs)
+    with names_from_file(but=logs or ()):
+        check_loggers(config.logs)
     processes = ProcessGroup(config.device, config.threads, config.precision)
+    if not config.dataset.exists():
+        raise DataError(
+            f"{folder}: its dataset is no longer at {config.dataset}; restore it, or change 'dataset' in {folder / RUN}"
+        )
     source = open_training_source(config.dataset)
     check_observer(trained, folder, source)
     if source.fingerprint != trained.fingerprint:
@@ -135,7 +187,10 @@ def resume_run(
         )
     step, groups = read_resume(folder)
     buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
-    trainer = Trainer(folder, config, make_policy(trained.policy), buffer, processes)
+    policy = build_policy(
+        trained.policy, groups.get("policy", {}), f"{folder}: its resume file does not fit its {POLICY}"
+    )
+    trainer = Trainer(folder, config, policy, buffer, processes)
     trainer.load_state(step, groups)
     return trainer
 
@@ -146,14 +201,18 @@ def run(
     """Train to the end; whether it was reached."""
     first = trainer.processes.is_first
     name, settings = trainer.folder.name, trainer.settings.model_dump(mode="json")
-    logs = [make_logger(log, trainer.folder, name, settings) for log in trainer.run.logs] if first else []
-    with writing_run(trainer.folder):
-        metrics = MetricsFile(trainer.folder, trainer.step, logs) if first else None
+    metrics = None
+    if first:
+        with writing_run(trainer.folder):
+            remove_leftovers(trainer.folder)
+            logs = [make_logger(log, trainer.folder, name, settings) for log in trainer.run.logs]
+            metrics = MetricsFile(trainer.folder, trainer.step, logs)
     try:
         return trainer.fit(metrics, report if first else _silent, should_stop)
     finally:
         if metrics is not None:
-            metrics.close()
+            with writing_run(trainer.folder):
+                metrics.close()
         trainer.processes.close()
 
 
@@ -168,13 +227,17 @@ def _new_policy(
     loaded = None if began_from is None else load_policy(began_from)
     channels = infer_channels(source, buffer)
     flow = settings.needs.flow
+    try:
+        normalizer = fit_normalizer(buffer, channels, settings)
+    except DataError as error:
+        raise DataError(f"{source.path}: {error}") from error
     spec = PolicySpec(
         settings=settings,
         state_width=buffer.state.shape[1],
         action_width=buffer.action.shape[1],
         tasks=buffer.tasks,
         channels=channels,
-        normalizer=fit_normalizer(source, buffer, channels, settings),
+        normalizer=normalizer,
         observer=source.provenance.observer,
         queries={} if flow is None else {**(source.provenance.queries or {}), **flow.query_settings},
     )

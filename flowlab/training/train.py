@@ -15,7 +15,7 @@ from flowlab.storage.dataset import Dataset
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import METRICS, last_metrics
 from flowlab.training.precision import Precision
-from flowlab.training.run import ComputeSettings, prepare_run, resume_run, run
+from flowlab.training.run import ComputeSettings, begin_run, resume_run, run
 from flowlab.training.trainer import Trainer, TrainingProgress
 
 CURVE = "curve.png"
@@ -105,7 +105,7 @@ def train(
 
     Args:
         data: A dataset, opened or its path, or a store in DP3's layout.
-        out: Folder of the run, which must not hold one yet.
+        out: Folder of the run. Where the same call began it earlier, it goes on as if it had never stopped.
         policy: ``fdp``, ``dp3``, ``mba``, what an installed package offers, or ``module:Class``, whose module may lie
             in the current folder.
         profile: ``fast``, ``paper``, or a YAML file; see :func:`~flowlab.policies.profiles.load_settings`.
@@ -124,7 +124,7 @@ def train(
         The run, of which ``folder`` is what :class:`flowlab.Policy` loads.
 
     Raises:
-        UsageError: A name, a setting or an option is wrong, or ``out`` holds a run already.
+        UsageError: A name, a setting or an option is wrong, or ``out`` holds a run that began in another way.
         DataError: The dataset cannot be read, or lacks what the policy is trained on.
         DivergedError: The loss is no longer a number.
     """
@@ -138,7 +138,7 @@ def train(
     check_loggers(tuple(logs), here)
     compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
     began = None if began_from is None else check_path(began_from, "began_from")
-    trainer = prepare_run(path_of(data), check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
+    trainer = begin_run(path_of(data), check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
     return _run(trainer, watch)
 
 
@@ -211,5 +211,7 @@ def _describe(trainer: Trainer) -> Iterator[str]:
         f"{len(planned.train)} demonstrations of {', '.join(spec.tasks)}; {len(planned.held_out)} held out; "
         f"{trainer.processes.description}"
     )
+    if trainer.step:
+        yield f"{trainer.folder}: goes on after step {trainer.step:,} of {planned.steps:,}"
     if spec.settings.relative_to_gripper and spec.channels.gripper is None:
         yield "points are given in the world frame: the data do not tell where in it the gripper is"

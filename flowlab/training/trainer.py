@@ -14,7 +14,15 @@ from flowlab.data.window_sampler import WindowSampler, index_windows
 from flowlab.errors import DataError, FlowlabError
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.checkpoint import RunConfig, save_resume, save_weights, writing_run
+from flowlab.policies.checkpoint import (
+    Groups,
+    RunConfig,
+    TrainedPolicy,
+    save_resume,
+    save_weights,
+    start_folder,
+    writing_run,
+)
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.metrics import MetricsFile, RunningMeans
 from flowlab.training.optimizer import EMA, Optimizers
@@ -133,21 +141,30 @@ class Trainer:
 
         Raises :class:`DivergedError` where weights are not finite, before anything is written.
         """
-        if not all(bool(p.isfinite().all()) for p in self.policy.parameters()):
-            raise self._diverged("a weight is no longer finite")
+        self._check_finite()
         if not self.processes.is_first:
             return
         if checkpoint is not None:
             save_weights(self.folder, self.average.policy, checkpoint)
-        groups = {
+        save_resume(self.folder, self.step, self.state())
+
+    def begin(self, trained: TrainedPolicy) -> None:
+        """Make the folder of a new run, from which it can be resumed. Raises :class:`UsageError` where there is one."""
+        self._check_finite()
+        if self.processes.is_first:
+            start_folder(self.folder, trained, self.run, self.state())
+        self.processes.wait()
+
+    def state(self) -> Groups:
+        """Everything that goes on changing, for :meth:`load_state`."""
+        return {
             "policy": self.policy.state_dict(),
             "average": self.average.policy.state_dict(),
             "optimizer": self.optimizers.state(),
             "means": {k: torch.tensor(v, dtype=torch.float64) for k, v in self._means.state().items()},
         }
-        save_resume(self.folder, self.step, groups)
 
-    def load_state(self, step: int, groups: dict[str, dict[str, torch.Tensor]]) -> None:
+    def load_state(self, step: int, groups: Groups) -> None:
         """Go on from what :func:`~flowlab.policies.checkpoint.read_resume` gives."""
         try:
             self.policy.load_state_dict(groups["policy"])
@@ -158,6 +175,10 @@ class Trainer:
             raise DataError(f"{self.folder}: its resume file does not fit its policy.json; start anew") from error
         self._means.load_state({name: float(value) for name, value in groups.get("means", {}).items()})
         self.step = step
+
+    def _check_finite(self) -> None:
+        if not all(bool(p.isfinite().all()) for p in self.policy.parameters()):
+            raise self._diverged("a weight is no longer finite")
 
     def _diverged(self, what: str) -> DivergedError:
         return DivergedError(

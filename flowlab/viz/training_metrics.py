@@ -1,15 +1,18 @@
 """What a training run's ``metrics.jsonl`` tells, line by line."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from flowlab.errors import DataError
+from flowlab.json_lines import read_lines
+from flowlab.text import shown
 
+_EXPECTED, _ADVICE = "a JSON object of numbers with kind and step", "delete the line"
 Series = tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]
 """Steps, and the value at each."""
 
@@ -25,26 +28,28 @@ class MetricsLine:
 
 def read_metrics(path: Path) -> list[MetricsLine]:
     """The lines of a run's metrics, at least one. A last line that a kill cut off is left out."""
-    try:
-        *whole, _ = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); a training run writes it") from error
-    lines = [_parse(path, number, text) for number, text in enumerate(whole, 1)]
+    if not path.exists():
+        raise DataError(f"{path}: there is no such file; a training run writes it")
+    lines = metrics_lines(path)
     if not lines:
         raise DataError(f"{path}: holds no whole line yet; a training run adds the first after some steps")
     return lines
 
 
-def _parse(path: Path, number: int, text: bytes) -> MetricsLine:
+def metrics_lines(path: Path) -> list[MetricsLine]:
+    """The lines of a run's metrics; none where there is no file. Raises :class:`DataError` where one is damaged."""
+    return [_parse(path, number, values) for number, values in read_lines(path, _EXPECTED, _ADVICE)]
+
+
+def _parse(path: Path, number: int, values: Any) -> MetricsLine:
     """One line. Raises :class:`DataError` where it is damaged."""
     try:
-        values = json.loads(text)
-        kind, step = str(values.pop("kind")), int(values.pop("step"))
-        return MetricsLine(kind, step, {name: float(value) for name, value in values.items()})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        plain = dict(values)
+        kind, step = str(plain.pop("kind")), int(plain.pop("step"))
+        return MetricsLine(kind, step, {name: float(value) for name, value in plain.items()})
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise DataError(
-            f"{path}: line {number} is damaged (expected a JSON object of numbers with kind and step, found "
-            f"{text[:60].decode(errors='replace')!r}); delete the line"
+            f"{path}: line {number} is damaged (expected {_EXPECTED}, found {shown(values)}); {_ADVICE}"
         ) from error
 
 

@@ -119,5 +119,6 @@ def test_an_old_policy_does_again_what_it_did(tmp_path: Path, capsys: Capture) -
     assert code == 0, err
     now = sorted((json.loads(line) for line in lines.read_bytes().splitlines()), key=lambda x: x["episode"])
     for mine, theirs in zip(map(in_old_words, now), then, strict=True):
+        mine.pop("sha256")
         assert mine.pop("flow") == pytest.approx(theirs.pop("flow"), rel=0.02), "another CPU rounds otherwise"
         assert mine == theirs

@@ -13,7 +13,6 @@ from synthetic import SETTINGS, call_cli, files_below, make_dataset, make_episod
 from trained_runs import (
     NETWORK,
     SMALL,
-    header_of,
     leftovers,
     lines_of,
     make_recorded,
@@ -21,6 +20,7 @@ from trained_runs import (
     make_run,
     options,
     policy_of,
+    step_in,
     train,
     weights_of,
 )
@@ -52,7 +52,7 @@ def check_run(run: Path, steps: int = 20, checkpoints: int = 5) -> None:
     assert sorted(str(f.relative_to(run)) for f in run.rglob("*") if f.is_file()) == sorted({*KEPT, *every})
     assert (run / "curve.png").read_bytes().startswith(b"\x89PNG")
     for path in every:
-        assert header_of(run / path)["__metadata__"] == {"step": str(int(path[17:25]))}
+        assert step_in(run / path) == int(path[17:25])
         assert all(np.isfinite(w).all() for w in weights_of(run, int(path[17:25])).values())
 
 
@@ -335,7 +335,6 @@ def test_data_that_cannot_be_trained_on(tmp_path: Path, capsys: Capture) -> None
         assert (code, out) == (3, "")
         assert sentence in err
         assert err.count("\n") == 1
-    shutil.rmtree(tmp_path / "no-poses/cache")
     assert {name: files_below(tmp_path / name) for name in before} == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["else", "empty", "no-poses"]
 
@@ -343,9 +342,10 @@ def test_data_that_cannot_be_trained_on(tmp_path: Path, capsys: Capture) -> None
 def test_a_run_is_not_overwritten(rolls: Path, taught: Path, tmp_path: Path, capsys: Capture) -> None:
     shutil.copytree(taught, tmp_path / "run")
     before = files_below(tmp_path)
-    code, out, err = call_cli(capsys, "train", rolls, "--policy", "fdp", "--out", tmp_path / "run", *SMALL)
+    command = ("train", rolls, "--policy", "dp3", "--out", tmp_path / "run", *SMALL, "--seed", "5")
+    code, out, err = call_cli(capsys, *command)
     assert (code, out) == (2, "")
-    assert f"run: holds a run already; go on with 'flowlab train {tmp_path / 'run'} --resume', or" in err
+    assert "run: holds a run already, which began in another way; choose another --out, or go on with it by" in err
     assert files_below(tmp_path) == before
 
 
@@ -363,7 +363,7 @@ def test_resume_goes_on_as_the_run_began(rolls: Path, taught: Path, tmp_path: Pa
     assert files_below(tmp_path) == before
     code, out, err = call_cli(capsys, "train", rolls, "--resume")
     assert (code, out) == (3, "")
-    assert f"{rolls}: no run to resume (it has no run.json); start one with 'flowlab train DATASET --out'" in err
+    assert f"{rolls}: not a training run (it has no policy.json); what a kill left of one begins again" in err
 
 
 def test_bf16_is_refused_where_it_would_be_slower(
@@ -380,12 +380,16 @@ def test_bf16_is_refused_where_it_would_be_slower(
     assert json.loads((tmp_path / "b/run.json").read_text())["precision"] == "fp32"
 
 
-def test_a_dataset_that_cannot_be_written_to_is_trained_on(tmp_path: Path, capsys: Capture) -> None:
-    """Its arrays are then decoded into the folder of the run; for a root user, a file in the way must do."""
+def test_where_the_cache_cannot_be_written_arrays_are_decoded_into_the_run(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a root user, a file in the way must do. The dataset is never written to; the same command goes on there."""
     make_rolls(tmp_path / "d")
-    (tmp_path / "d/cache").write_text("in the way")
+    (tmp_path / "cache").write_text("in the way")
+    monkeypatch.setenv("FLOWLAB_CACHE", str(tmp_path / "cache"))
     before = files_below(tmp_path / "d")
-    train(capsys, tmp_path / "d", "--policy", "fdp", "--out", tmp_path / "run", *SMALL)
+    for _ in range(2):
+        train(capsys, tmp_path / "d", "--policy", "dp3", "--out", tmp_path / "run", *SMALL)
     assert files_below(tmp_path / "d") == before
     assert sorted(p.name for p in (tmp_path / "run").iterdir()) == sorted([*KEPT, "cache", "checkpoints"])
 

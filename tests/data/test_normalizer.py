@@ -14,6 +14,7 @@ from flowlab.data.normalizer import Normalizer, Scale, Scaler, fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.data.training_settings import TrainSettings
+from flowlab.errors import DataError
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.dp3 import DP3Exporter
@@ -28,8 +29,8 @@ def open_both(folder: Path, episodes: list[Episode]) -> tuple[TrainingSource, Re
 
 
 def fitted(folder: Path, episodes: list[Episode], *overrides: str, layout: ChannelSpec | None = None) -> Normalizer:
-    source, buffer = open_both(folder, episodes)
-    return fit_normalizer(source, buffer, layout or ChannelSpec(), tiny_settings("fdp", *overrides))
+    _, buffer = open_both(folder, episodes)
+    return fit_normalizer(buffer, layout or ChannelSpec(), tiny_settings("fdp", *overrides))
 
 
 def normal(values: np.ndarray, scale: Scale) -> np.ndarray:
@@ -55,9 +56,9 @@ def test_where_scenes_are_turned_displacements_are_alike_in_all_directions(tmp_p
 
     episodes = [narrow(make_episode(k)) for k in range(3)]
     layout = ChannelSpec(gripper=FIRST, state_positions=(FIRST,), action_displacement=FIRST)
-    source, buffer = open_both(tmp_path / "d", episodes)
+    _, buffer = open_both(tmp_path / "d", episodes)
     plain, turned = (
-        fit_normalizer(source, buffer, layout, tiny_settings("fdp", f"batch.turn_deg={d}")).action for d in (0, 30)
+        fit_normalizer(buffer, layout, tiny_settings("fdp", f"batch.turn_deg={d}")).action for d in (0, 30)
     )
     largest = np.abs(all_of(episodes, "action")[:, :3]).max()
     np.testing.assert_allclose(turned.unit[:3], largest)
@@ -157,9 +158,9 @@ def test_without_flow_there_is_a_normalizer_too(tmp_path: Path) -> None:
     DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "s.zarr")
     source = open_training_source(tmp_path / "s.zarr")
     settings = tiny_settings("dp3")
-    found = fit_normalizer(source, load_buffer(source, tmp_path), ChannelSpec(), settings)
+    found = fit_normalizer(load_buffer(source, tmp_path), ChannelSpec(), settings)
     dataset = open_training_source(tmp_path / "d")
-    wanted = fit_normalizer(dataset, load_buffer(dataset, tmp_path), ChannelSpec(), settings)
+    wanted = fit_normalizer(load_buffer(dataset, tmp_path), ChannelSpec(), settings)
     for name in ("position", "state", "action"):
         assert getattr(found, name) == getattr(wanted, name), name
 
@@ -185,14 +186,14 @@ def test_limits_of_actions_relative_to_the_gripper_are_those_of_all_windows(
     layout = infer_channels(source, buffer)
     assert layout.action_position == FIRST
     settings = tiny_settings("dp3", "encoder.relative=true", *overrides)
-    found = fit_normalizer(source, buffer, layout, settings).action
+    found = fit_normalizer(buffer, layout, settings).action
     values = normal(relative_actions(buffer, settings), found)
     moving = np.array(found.unit) != 1  # the hand goes neither sideways nor up
     assert moving.tolist() == [True, False, False, True, True, True, True, True]
     np.testing.assert_allclose(values.min(0)[moving], -1, atol=1e-5)
     np.testing.assert_allclose(values.max(0)[moving], 1, atol=1e-5)
     assert np.abs(values[:, ~moving]).max() < 1e-4
-    absolute = fit_normalizer(source, buffer, layout, tiny_settings("dp3", *overrides)).action
+    absolute = fit_normalizer(buffer, layout, tiny_settings("dp3", *overrides)).action
     np.testing.assert_allclose(normal(buffer.action, absolute).max(0)[[0, *range(3, 8)]], 1, atol=1e-5)
 
 
@@ -203,3 +204,30 @@ def test_there_and_back() -> None:
     found = scaler(torch.tensor([1.5, 2, 2.9]))
     torch.testing.assert_close(found, torch.tensor([1.0, 1, -1]), rtol=1e-5, atol=1e-5)
     assert not scaler.state_dict(), "its numbers are kept with the settings"
+
+
+@pytest.mark.parametrize("field", ["state", "action", "point_cloud", "tracks"])
+def test_what_is_no_number_is_refused(field: str, tmp_path: Path) -> None:
+    """A single one is enough, which a dataset's own statistics may not tell of."""
+    _, buffer = open_both(tmp_path / "d", [make_episode(k) for k in range(2)])
+    values = np.array(getattr(buffer, field))
+    values.reshape(-1)[-5] = np.nan
+    with pytest.raises(DataError, match=f"'{field}' has values that are not finite; 'flowlab validate' tells where"):
+        fit_normalizer(replace(buffer, **{field: values}), ChannelSpec(), tiny_settings("fdp"))
+
+
+@pytest.mark.parametrize("scale", ["limits", "quantile"])
+def test_scales_are_those_of_the_datas_statistics_bit_for_bit(scale: str, tmp_path: Path) -> None:
+    """And of the data themselves: what receipts say of them changes nothing."""
+    source, buffer = open_both(tmp_path / "d", [make_episode(k) for k in range(3)])
+    stats = Dataset(source.path).stats
+    settings = tiny_settings("fdp", f"motion.scale={scale}")
+    found = fit_normalizer(buffer, ChannelSpec(), settings)
+    for name in ("state", "action"):
+        assert getattr(found, name) == Scale.of_limits(stats["arrays"][name]["min"], stats["arrays"][name]["max"])
+    largest = max(map(abs, [*stats["arrays"]["flow"]["min"], *stats["arrays"]["flow"]["max"]]))
+    assert found.flow is not None
+    assert found.flow.unit[0] == (largest if scale == "limits" else min(stats["motion"]["step_m"]["p99"], largest))
+    for path in (source.path / "receipts").iterdir():
+        path.write_text(path.read_text().replace('"max": [', '"max": [1000').replace('"steps": [', '"steps": [9'))
+    assert fit_normalizer(load_buffer(source, tmp_path), ChannelSpec(), settings) == found

@@ -1,23 +1,41 @@
-"""Demonstrations are decoded once, into what the dataset holds, or not at all."""
+"""Demonstrations are decoded once on a machine, into what the dataset holds, or not at all; no dataset's own cache is
+believed, read or written."""
 
+import json
 import resource
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from builders import random_buffer
 from synthetic import files_below, make_dataset, make_episode, with_quality
 
+from flowlab.checksums import with_checksum
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.windows import Windows
 from flowlab.errors import DataError
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.dp3 import DP3Exporter
+from flowlab.storage.shard import write_shard
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where decoded datasets lie, for this test alone."""
+    monkeypatch.setenv("FLOWLAB_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache/datasets"
+
+
+def decoded(cache: Path) -> list[str]:
+    """What there is of decoded datasets: ``content/part``."""
+    return sorted(str(part.relative_to(cache)) for part in cache.glob("*/*"))
 
 
 def make_episodes() -> list[Episode]:
@@ -79,49 +97,155 @@ def test_a_corpus_without_poses_or_tracks_has_none(tmp_path: Path) -> None:
     assert buffer.queries.shape == (3, 0, 3)
 
 
-def test_a_dataset_is_decoded_once(tmp_path: Path) -> None:
+def test_a_dataset_is_decoded_once(tmp_path: Path, cache: Path) -> None:
+    """And it and copies of it share that."""
     episodes = make_episodes()
     source = write(tmp_path / "d", episodes)
     load_buffer(source, tmp_path / "run")
-    before = files_below(tmp_path / "d" / "cache")
+    before = files_below(cache)
     shutil.rmtree(tmp_path / "d" / "shards")
-    check(load_buffer(open_training_source(tmp_path / "d"), tmp_path / "run"), episodes)
-    assert files_below(tmp_path / "d" / "cache") == before
+    shutil.copytree(tmp_path / "d", tmp_path / "copy")
+    for data in ("d", "copy"):
+        check(load_buffer(open_training_source(tmp_path / data), tmp_path / "run"), episodes)
+    assert files_below(cache) == before
+    assert not (tmp_path / "d/cache").exists()
 
 
-def test_other_content_is_decoded_anew_in_place_of_the_old(tmp_path: Path) -> None:
+def test_a_store_of_another_name_has_another_task(tmp_path: Path) -> None:
+    write(tmp_path / "d", make_episodes())
+    DP3Exporter().export(Dataset(tmp_path / "d"), tmp_path / "pour.zarr", "push")
+    shutil.copytree(tmp_path / "pour.zarr", tmp_path / "wipe.zarr")
+    for task in ("pour", "wipe"):
+        assert load_buffer(open_training_source(tmp_path / f"{task}.zarr"), tmp_path).tasks == (task,)
+
+
+def test_other_content_is_decoded_anew_in_place_of_the_old(tmp_path: Path, cache: Path) -> None:
+    """Of the same dataset; that of others stays, and so does what is not ours."""
     episodes = make_episodes()
+    load_buffer(write(tmp_path / "other", episodes[:4]), tmp_path / "run")
     old = load_buffer(write(tmp_path / "d", episodes), tmp_path / "run")
+    (mine,) = (p for p in cache.iterdir() if str(tmp_path / "d") in (p / "arrays/index.json").read_text())
+    theirs = tmp_path / "home"
+    shutil.copytree(mine, theirs)
+    (cache / "linked").symlink_to(theirs, target_is_directory=True)
+    (cache / "inner").mkdir()
+    (cache / "inner/arrays").symlink_to(theirs / "arrays", target_is_directory=True)
+    (mine / "photos").mkdir()
+    kept = files_below(theirs)
     shutil.rmtree(tmp_path / "d" / "shards")
     shutil.rmtree(tmp_path / "d" / "receipts")
     changed = [replace(e, action=e.action + 1) for e in episodes]
     check(load_buffer(write(tmp_path / "d", changed), tmp_path / "run"), changed)
-    assert len(list((tmp_path / "d" / "cache").iterdir())) == 1, "what is outdated takes room"
+    assert files_below(theirs) == kept
+    assert [p.name for p in mine.iterdir()] == ["photos"], "what is outdated takes room"
+    assert len(decoded(cache)) == 1 + 1 + 1 + 2  # of the other, of this, photos, what the links show
     check(old, episodes)
 
 
-def block(folder: Path) -> None:
-    """Let nothing be made in a folder below this one, whoever asks: root is not told by permissions."""
-    folder.mkdir(exist_ok=True)
-    (folder / "cache").write_text("in the way")
-
-
-def test_beside_a_dataset_that_cannot_be_written_the_run_keeps_the_corpus(tmp_path: Path) -> None:
+def test_where_the_cache_cannot_be_written_the_run_keeps_the_arrays(
+    tmp_path: Path, cache: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Root is not told by permissions, so a file is in the way."""
     episodes = make_episodes()
     source = write(tmp_path / "d", episodes)
-    block(tmp_path / "d")
+    cache.parent.write_text("in the way")
     check(load_buffer(source, tmp_path / "run"), episodes)
     shutil.rmtree(tmp_path / "d" / "shards")
     check(load_buffer(source, tmp_path / "run"), episodes)
-    (tmp_path / "d" / "cache").unlink()
-    check(load_buffer(source, tmp_path / "run"), episodes)  # what the run has is not decoded again elsewhere
-    block(tmp_path / "d")
-    block(tmp_path / "other")
-    with pytest.raises(DataError, match=f"{tmp_path / 'other'}: cannot be written; choose another --out"):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/cache").symlink_to(tmp_path / "run", target_is_directory=True)
+    with pytest.raises(DataError, match=r"cannot be written \(.*\); .*other/cache: is a link.*set FLOWLAB_CACHE"):
         load_buffer(source, tmp_path / "other")
+    with pytest.raises(DataError, match="set FLOWLAB_CACHE to a folder"):
+        Windows(tmp_path / "d", {"state": [0]})
+    assert len(Windows(tmp_path / "d", {"state": [0]}, cache=tmp_path / "run")) == sum(map(len, episodes))
 
 
-def test_what_cannot_be_decoded_leaves_nothing_behind(tmp_path: Path) -> None:
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) * 2 // 3] ^= 4
+    path.write_bytes(content)
+
+
+def link(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+def forge(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    """Someone wrote another index, with the right digest."""
+
+    def damage(path: Path) -> None:
+        values = json.loads((path.parent / "index.json").read_text())
+        change(values)
+        values.pop("sha256", None)
+        (path.parent / "index.json").write_text(json.dumps(with_checksum(values)))
+
+    return damage
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "cut": cut,
+    "flipped": flip,
+    "missing": Path.unlink,
+    "a device": link,
+    "index cut": lambda p: cut(p.parent / "index.json"),
+    "index flipped": lambda p: flip(p.parent / "index.json"),
+    "index missing": lambda p: (p.parent / "index.json").unlink(),
+    "index a list": lambda p: (p.parent / "index.json").write_text("[]"),
+    "index empty": lambda p: (p.parent / "index.json").write_text("{}"),
+    "leads out": forge(lambda v: v["arrays"].update({"../../../x": 0})),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_what_is_damaged_is_decoded_anew(
+    damage: str, tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    episodes = make_episodes()
+    source = write(tmp_path / "d", episodes)
+    load_buffer(source, tmp_path / "run")
+    (part,) = cache.glob("*/arrays")
+    whole = {name: content for name, (content, _) in files_below(cache).items()}
+    DAMAGES[damage](part / "state.npy")
+    check(load_buffer(source, tmp_path / "run"), episodes)
+    assert [r.getMessage().endswith("; the dataset is decoded again") for r in caplog.records] == [True]
+    assert {name: content for name, (content, _) in files_below(cache).items()} == whole
+
+
+def test_a_cache_that_came_with_a_dataset_is_neither_read_nor_written(tmp_path: Path) -> None:
+    """Nor deleted, nor followed where it is a link."""
+    episodes = make_episodes()
+    source = write(tmp_path / "d", episodes)
+    load_buffer(source, tmp_path / "run")
+    (tmp_path / "home").mkdir()
+    shutil.move(tmp_path / "cache/datasets", tmp_path / "home/cache")
+    (tmp_path / "d/cache").symlink_to(tmp_path / "home/cache", target_is_directory=True)
+    for path in (tmp_path / "home/cache").glob("*/arrays/action.npy"):
+        flip(path)
+    before = files_below(tmp_path / "home")
+    check(load_buffer(source, tmp_path / "run"), episodes)
+    assert files_below(tmp_path / "home") == before
+
+
+def test_an_episode_that_is_not_as_its_receipt_says_is_refused(tmp_path: Path) -> None:
+    """Else whoever ships a dataset under another's fingerprint would decide what that other is trained on."""
+    episodes = make_episodes()
+    dataset = make_dataset(tmp_path / "d", [episodes[:3]])
+    write_shard(
+        tmp_path / "d" / dataset.receipts[0].shard,
+        [replace(episodes[0], state=episodes[0].state + 1), *episodes[1:3]],
+        dataset.manifest.settings_digest,
+    )
+    with pytest.raises(DataError, match=r"seed 0: content differs from what its receipt says"):
+        load_buffer(open_training_source(tmp_path / "d"), tmp_path / "run")
+
+
+def test_what_cannot_be_decoded_leaves_nothing_behind(tmp_path: Path, cache: Path) -> None:
     episodes = make_episodes()
     source = write(tmp_path / "d", episodes)
 
@@ -131,17 +255,7 @@ def test_what_cannot_be_decoded_leaves_nothing_behind(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         load_buffer(replace(source, episodes=cut_short), tmp_path / "run")
-    assert list((tmp_path / "d" / "cache").iterdir()) == []
-    check(load_buffer(source, tmp_path / "run"), episodes)
-
-
-def test_what_a_kill_left_half_made_is_made_again(tmp_path: Path) -> None:
-    episodes = make_episodes()
-    source = write(tmp_path / "d", episodes)
-    load_buffer(source, tmp_path / "run")
-    (cache,) = (tmp_path / "d" / "cache").iterdir()
-    (cache / "index.json").unlink()
-    (cache / "action.npy").write_bytes(b"half")
+    assert decoded(cache) == []
     check(load_buffer(source, tmp_path / "run"), episodes)
 
 
@@ -156,20 +270,20 @@ def files_no_larger_than(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_disk_without_room_is_one_sentence(tmp_path: Path) -> None:
+def test_a_disk_without_room_is_one_sentence(tmp_path: Path, cache: Path) -> None:
     episodes = make_episodes()
     source = write(tmp_path / "d", episodes)
     with (
         files_no_larger_than(20_000),
-        pytest.raises(DataError, match=r"cache/.*: cannot be written \(File too large\)"),
+        pytest.raises(DataError, match=r"cannot be written \(File too large\); .*make room"),
     ):
         load_buffer(source, tmp_path / "run")
-    assert list((tmp_path / "d" / "cache").iterdir()) == []
+    assert decoded(cache) == []
     check(load_buffer(source, tmp_path / "run"), episodes)
 
 
 @pytest.mark.parametrize("field", ["point_cloud", "state", "action", "object_pose", "tracks"])
-def test_demonstrations_of_different_widths_are_refused(tmp_path: Path, field: str) -> None:
+def test_demonstrations_of_different_widths_are_refused(tmp_path: Path, cache: Path, field: str) -> None:
     last = make_episode(2)
     if field == "point_cloud":
         last = replace(last, point_cloud=last.point_cloud[:, :50])
@@ -186,7 +300,7 @@ def test_demonstrations_of_different_widths_are_refused(tmp_path: Path, field: s
         DataError, match=rf"{tmp_path / 'd'}: roll seed 2: '{name}' is .* wide, .*; train on one of them"
     ):
         load_buffer(source, tmp_path / "run")
-    assert list((tmp_path / "d" / "cache").iterdir()) == []
+    assert decoded(cache) == []
 
 
 def test_an_empty_dataset_is_refused(tmp_path: Path) -> None:
@@ -223,12 +337,12 @@ def pictured(seed: int, *, rgb: bool = True) -> Episode:
     return replace(e, rgb=color if rgb else None, depth=rng.random((len(e), 12, 16), np.float32))
 
 
-def test_pictures_are_decoded_when_they_are_wanted(tmp_path: Path) -> None:
+def test_pictures_are_decoded_when_they_are_wanted(tmp_path: Path, cache: Path) -> None:
     episodes = [pictured(k) for k in range(3)]
     source = write(tmp_path / "d", episodes)
     plain = load_buffer(source, tmp_path / "run")
     assert (plain.rgb, plain.depth) == (None, None)
-    before = files_below(tmp_path / "d/cache")
+    before = files_below(cache)
     assert not any("rgb" in name or "depth" in name for name in before)
     buffer = load_buffer(source, tmp_path / "run", ("rgb",))
     assert buffer.depth is None
@@ -239,7 +353,7 @@ def test_pictures_are_decoded_when_they_are_wanted(tmp_path: Path) -> None:
     both = load_buffer(source, tmp_path / "run", ("rgb", "depth"))
     assert both.depth is not None
     np.testing.assert_array_equal(both.depth[both.episodes[1].start], episodes[1].depth[0])
-    after = files_below(tmp_path / "d/cache")
+    after = files_below(cache)
     assert {name: after[name] for name in before} == before, "what was decoded is not decoded again"
 
 
@@ -256,20 +370,3 @@ def test_pictures_of_some_episodes_only_are_refused(tmp_path: Path) -> None:
     load_buffer(source, tmp_path / "run")
     with pytest.raises(DataError, match="roll seed 2: 'rgb' is in some episodes only; train on those that have it"):
         load_buffer(source, tmp_path / "run", ("rgb",))
-
-
-def test_nothing_is_deleted_that_is_not_ours(tmp_path: Path) -> None:
-    """A stranger's dataset may have anything in its cache, or a link in its place."""
-    data, home = tmp_path / "data", tmp_path / "home"
-    make_dataset(data, [[make_episode(0)]])
-    for folder in (data / "cache" / "photos", data / "cache" / "0123456789abcdef-1", home / "photos"):
-        folder.mkdir(parents=True)
-        (folder / "a.txt").write_text("kept")
-    load_buffer(open_training_source(data), tmp_path / "run")
-    assert (data / "cache" / "photos" / "a.txt").exists()
-    assert (data / "cache" / "0123456789abcdef-1" / "a.txt").exists(), "our form, but not our mark"
-    shutil.rmtree(data / "cache")
-    (data / "cache").symlink_to(home, target_is_directory=True)
-    load_buffer(open_training_source(data), tmp_path / "run")
-    assert (home / "photos" / "a.txt").exists()
-    assert [p.name for p in home.iterdir()] == ["photos"]

@@ -1,12 +1,14 @@
 """What became of episodes survives any kill."""
 
 import multiprocessing
+import resource
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from flowlab.errors import DataError
-from flowlab.evaluation.episode_log import append_result, read_results, repair_tail
+from flowlab.evaluation.episode_log import append_result, read_results
 from flowlab.evaluation.results import EpisodeResult, RolloutFlowError
 from flowlab.evaluation.trials import Trial
 
@@ -52,27 +54,46 @@ def test_a_line_cut_off_at_any_byte_is_forgotten_and_mended(tmp_path: Path) -> N
     for cut in range(len(line)):
         path.write_bytes(whole + line[:cut])
         assert list(read_results(path).values()) == [first, second]
-        repair_tail(path)
-        assert path.read_bytes() == whole
         append_result(path, third)
         assert path.read_bytes() == whole + line
         assert list(read_results(path).values()) == [first, second, third]
     for cut in range(1, whole.index(b"\n") + 1):  # nothing whole is left
         path.write_bytes(whole[:cut])
         assert read_results(path) == {}
-        repair_tail(path)
-        assert path.read_bytes() == b""
+        append_result(path, third)
+        assert path.read_bytes() == line
     assert [p.name for p in tmp_path.iterdir()] == ["episodes.jsonl"]
 
 
-def test_what_is_whole_is_not_touched(tmp_path: Path) -> None:
-    repair_tail(tmp_path / "none.jsonl")
-    assert list(tmp_path.iterdir()) == []
+def test_a_changed_byte_anywhere_is_found(tmp_path: Path) -> None:
+    """In a line or its end; none passes for another result."""
     path = tmp_path / "episodes.jsonl"
-    append_result(path, result_of())
-    before = path.stat()
-    repair_tail(path)
-    assert (path.stat().st_mtime_ns, path.stat().st_ino) == (before.st_mtime_ns, before.st_ino)
+    for one in (result_of(0, flow=FLOW), result_of(1)):
+        append_result(path, one)
+    whole, known = path.read_bytes(), read_results(path)
+    for position in range(len(whole) - 1):
+        for bit in (1, 4, 32):
+            content = bytearray(whole)
+            content[position] ^= bit
+            path.write_bytes(content)
+            with suppress(DataError):
+                assert read_results(path) == known, "a changed byte has no meaning, or is found"
+
+
+def test_a_disk_without_room_leaves_no_half_of_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.jsonl"
+    append_result(path, result_of(0))
+    whole = path.read_bytes()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 30, before[1]))
+    try:
+        with pytest.raises(
+            DataError, match=r"cannot be written \(.*\); what was kept before is whole; make room, then"
+        ):
+            append_result(path, result_of(1))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_bytes() == whole
 
 
 GOOD = result_of().model_dump_json()
@@ -83,11 +104,13 @@ GOOD = result_of().model_dump_json()
     [
         ("{", "'{'"),
         ("", "''"),
-        ("[1]", "'[1]'"),
+        ("[1]", "(found [1])"),
         (GOOD[:40] + GOOD, None),
-        (GOOD.replace('"task"', '"tsak"'), None),
-        (GOOD.replace('"steps":57', '"steps":"many"'), None),
-        (GOOD.replace('"steps"', '"more":1,"steps"'), None),
+        (GOOD.replace('"task"', '"tsak"'), "task: Field required"),
+        (GOOD.replace('"steps":57', '"steps":"many"'), "steps: Input should be a valid integer, unable"),
+        (GOOD.replace('"steps"', '"more":1,"steps"'), "no setting is called 'more'"),
+        ("[" * 5000, None),
+        ("1" * 5000, None),
     ],
 )
 def test_a_damaged_line_is_said_by_file_and_number(tmp_path: Path, line: str, shown: str | None) -> None:
@@ -95,10 +118,10 @@ def test_a_damaged_line_is_said_by_file_and_number(tmp_path: Path, line: str, sh
     path.write_text(f"{GOOD}\n{GOOD}\n{line}\n{GOOD}\n")
     with pytest.raises(DataError) as raised:
         read_results(path)
-    assert str(raised.value) == (
-        f"{path}: line 3 is damaged (expected how an episode went, found {shown or repr(line[:60])}); delete the line, "
-        "and the episode is tried again"
-    )
+    said = str(raised.value)
+    assert said.startswith(f"{path}: line 3 is damaged (")
+    assert said.endswith("; delete the line, and the episode is tried again")
+    assert (shown or f"expected how an episode went, found '{line[:60]}'") in said
 
 
 def test_bytes_that_are_no_text_are_said_too(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -14,10 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from safetensors.numpy import load_file, save_file
 from synthetic import call_cli, files_below
 from trained_runs import NETWORK, leftovers, make_run, options, policy_of
 
+import flowlab
 from flowlab.cli import main
+from flowlab.errors import DataError
 from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.policies.checkpoint import load_policy
@@ -74,7 +78,10 @@ def evaluate(capsys: Capture, *arguments: str | Path | int) -> str:
 
 
 def lines_of(run: Path, place: str = PLACE) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (run / place).read_text().splitlines()]
+    """Without their digests."""
+    lines = [json.loads(line) for line in (run / place).read_text().splitlines()]
+    assert all(line.pop("sha256") for line in lines)
+    return lines
 
 
 def in_order(run: Path) -> list[str]:
@@ -292,10 +299,57 @@ def test_a_policy_that_knows_another_world_is_refused(data: Path, tmp_path: Path
     assert f"'flowlab eval {run} --offline'" in err
 
 
+def test_a_run_that_cannot_be_written_is_one_sentence(fdp: Path, tmp_path: Path, capsys: Capture) -> None:
+    """Root is not told by permissions, so a file is in the way; a link may not lead out of a stranger's run."""
+    run, home = copy(fdp, tmp_path), tmp_path / "home"
+    asked = (run, "--episodes", "1", "--seeds", "0", "--workers", "1")
+    (run / "evaluation").write_text("")
+    code, err = refused(capsys, *asked)
+    assert code == 3
+    assert "cannot be written (" in err
+    assert err.endswith("; make room, or copy the run to where it can be written\n")
+    (run / "evaluation").unlink()
+    home.mkdir()
+    (run / "evaluation").symlink_to(home, target_is_directory=True)
+    code, err = refused(capsys, *asked)
+    assert code == 3
+    assert f"is a link that leads out of {run}" in err
+    (run / "evaluation").unlink()
+    (run / PLACE).parent.mkdir(parents=True)
+    (run / PLACE).symlink_to(home / "file")
+    assert refused(capsys, *asked)[0] == 3
+    assert list(home.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("scene", {"camera": 5}, "policy.json: scene: camera: "),
+        ("observer", {"crop": {"low": [{"a": 1}, 0, 0], "high": [1, 1, 1]}}, "the policy's observer: crop.low.0: "),
+        ("queries", {"points": "many"}, "the policy's queries: points: "),
+    ],
+)
+def test_settings_that_are_none_are_one_sentence(key: str, value: object, said: str, fdp: Path, tmp_path: Path) -> None:
+    """In parts of a run that are looked at when they are used."""
+    run = copy(fdp, tmp_path)
+    about = policy_of(run)
+    about.pop("sha256")
+    (about if key == "scene" else about["policy"])[key] = value
+    (run / "policy.json").write_text(json.dumps(about))
+    for path in run.glob("checkpoints/*"):  # as of an earlier version, which told nothing of policy.json
+        save_file(load_file(path), path, {"step": str(int(path.stem[5:]))})
+    with pytest.raises(DataError, match=re.escape(said)):
+        flowlab.evaluate(run, episodes=1, seeds=0, workers=1)
+    if key != "scene":
+        with pytest.raises(DataError, match=re.escape(said)):
+            flowlab.Policy.load(run, TASK)
+
+
 def test_runs_without_a_common_task(fdp: Path, tmp_path: Path, capsys: Capture) -> None:
     other = copy(fdp, tmp_path, "other")
     about = policy_of(other)
     about["policy"]["tasks"] = ["hammer", "push"]
+    about.pop("sha256")
     (other / "policy.json").write_text(json.dumps(about))
     code, err = refused(capsys, fdp, other)
     assert code == 2

@@ -159,8 +159,9 @@ def test_workers_are_single_threaded_and_do_not_outlive_their_parent(tmp_path: P
     assert wait_for(lambda: not any(alive(pid) for pid, _ in workers), 10), "orphans are left"
 
 
-def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
-    """Workers import what they work with, and not the program that asked for it."""
+@pytest.mark.parametrize("from_stdin", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_script_without_a_guard_runs_once(from_stdin: bool, tmp_path: Path) -> None:
+    """Workers import what they work with, and not the program that asked for it, which may have no file."""
     script = tmp_path / "script" / "main.py"
     script.parent.mkdir()
     script.write_text(
@@ -172,8 +173,9 @@ def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
         "print(len(dataset))\n"
     )
     log = tmp_path / "log"
+    command = [sys.executable, "-" if from_stdin else script, log, tmp_path / "data"]
     done = subprocess.run(
-        [sys.executable, script, log, tmp_path / "data"], capture_output=True, text=True, timeout=120, check=False
+        command, input=script.read_text(), capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path
     )
     assert (done.returncode, done.stdout, log.read_text()) == (0, "1\n", "ran "), done.stderr[-500:]
 

@@ -5,6 +5,7 @@ import os
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -18,7 +19,6 @@ from safetensors.numpy import save_file
 from synthetic import call_cli, files_below, make_dataset, make_episode
 from trained_runs import (
     SMALL,
-    header_of,
     leftovers,
     lines_of,
     make_rolls,
@@ -26,11 +26,13 @@ from trained_runs import (
     options,
     saved_by,
     small_settings,
+    step_in,
     train,
     weights_of,
     without_times,
 )
 
+from flowlab.policies.checkpoint import RESUME
 from flowlab.policies.profiles import load_settings
 from flowlab.training import run as training_run
 
@@ -118,8 +120,8 @@ def test_a_run_goes_on_as_if_it_had_never_stopped(
         if code:  # else it was over before the signal
             break
     assert code == (-signal.SIGKILL if number == signal.SIGKILL else 130), f"after {wait_s:.2f} s"
-    step = int(header_of(run / "resume.safetensors")["__metadata__"]["step"])
-    assert 0 < step < STEPS
+    step = step_in(run / "resume.safetensors")
+    assert step < STEPS  # 0 where the first checkpoint is there, and what resuming needs not yet
     if number != signal.SIGKILL:
         assert out.splitlines()[-1] == f"stopped at step {step} of {STEPS}; go on with: flowlab train {run} --resume"
     said = train(capsys, run, "--resume")
@@ -171,6 +173,58 @@ def test_a_run_that_dies_at_once_can_be_resumed(rolls: Path, tmp_path: Path, cap
     check_same(tmp_path / "died", tmp_path / "whole")
 
 
+BEGUN = ("resume.safetensors", "run.json", "policy.json")
+"""The files of a run that begins, in the order in which they appear."""
+
+
+@pytest.mark.parametrize("there", [(), BEGUN[:1], BEGUN[:2], BEGUN[1:], BEGUN[2:], BEGUN], ids="+".join)
+def test_whatever_a_kill_leaves_of_a_beginning_goes_on_by_the_same_command(
+    there: tuple[str, ...], rolls: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """Of earlier versions, too, which wrote the resume file last; and nothing of a dead process is left."""
+    command = (rolls, "--policy", "dp3", *SMALL, "--device", "cpu", "--out")
+    run = tmp_path / "killed"
+    settings = small_settings("dp3", "run.seed=7")  # of another try: what is left of it is not built upon
+    training_run.prepare_run(rolls, run, settings, training_run.ComputeSettings(device="cpu"))
+    for name in set(BEGUN) - set(there):
+        (run / name).unlink()
+    leftover = run / f".tmp-{socket.gethostname()}+999999999+{RESUME}"
+    leftover.write_bytes(b"half")
+    if there == BEGUN:
+        code, out, err = call_cli(capsys, "train", *command, run)
+        assert (code, out) == (2, "")
+        assert f"{run}: holds a run already, which began in another way; choose another --out" in err
+        assert "settings.run.seed: the run has 7, this command has 0" in err
+        command = (*command[:-1], "--set", "run.seed=7", "--out")
+    else:
+        code, _, err = call_cli(capsys, "train", run, "--resume")
+        assert code == 3
+        assert err.count("\n") == 1
+    train(capsys, *command, run)
+    train(capsys, *command, tmp_path / "whole")
+    check_same(run, tmp_path / "whole")
+    before = files_below(run)
+    train(capsys, *command, run)
+    after = files_below(run)
+    kept = [name for name in before if name not in ("curve.png", "metrics.jsonl")]
+    assert {n: after[n] for n in kept if "resume" not in n} == {n: before[n] for n in kept if "resume" not in n}
+
+
+def test_the_same_command_goes_on_where_a_run_stopped(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
+    run = stopped(rolls, tmp_path / "run")
+    command = (rolls, "--policy", "dp3", *SMALL, "--device", "cpu", "--out")
+    code, _, err = call_cli(capsys, "train", *command, run)
+    assert code == 0
+    assert f"{run}: goes on after step 9 of 20" in err
+    train(capsys, *command, tmp_path / "whole")
+    check_same(run, tmp_path / "whole")
+    for other, said in (("--overfit", "run.overfit"), ("--from", "run.from")):
+        value = "1" if other == "--overfit" else str(tmp_path / "whole")
+        code, _, err = call_cli(capsys, "train", *command, run, other, value)
+        assert code == 2
+        assert said in err
+
+
 def test_ctrl_c_before_there_is_anything_to_draw(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     """No line of metrics, no checkpoint: it stops as cleanly as later."""
 
@@ -189,7 +243,7 @@ def test_ctrl_c_before_there_is_anything_to_draw(rolls: Path, tmp_path: Path, ca
     report = json.loads(out)
     assert (report["finished"], report["training"], report["validation"]) == (False, {}, {})
     assert 0 < report["step"] < 50
-    assert int(header_of(tmp_path / "run/resume.safetensors")["__metadata__"]["step"]) == report["step"]
+    assert step_in(tmp_path / "run/resume.safetensors") == report["step"]
 
 
 def test_a_finished_run_stays_as_it_is(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -236,8 +290,23 @@ def test_other_data_are_refused(tmp_path: Path, capsys: Capture) -> None:
     )
     rolls.rename(tmp_path / "moved")
     code, out, err = call_cli(capsys, "train", run, "--resume")
-    assert (code, out, err) == (3, "", f"flowlab: {rolls}: there is no such folder\n")
+    assert (code, out) == (3, "")
+    assert f"{run}: its dataset is no longer at {rolls}; restore it, or change 'dataset' in {run / 'run.json'}" in err
     assert files_below(run) == before
+
+
+def test_where_the_dataset_is_may_be_changed(tmp_path: Path, capsys: Capture) -> None:
+    """It is the only thing in a run that may; its content is checked."""
+    rolls = make_rolls(tmp_path / "d")
+    run = stopped(rolls, tmp_path / "run")
+    rolls.rename(tmp_path / "moved")
+    plan = run / "run.json"
+    plan.write_text(plan.read_text().replace(str(rolls), str(tmp_path / "moved")))
+    assert "trained for 20 steps" in train(capsys, run, "--resume")
+    plan.write_text(plan.read_text().replace('"steps": 20', '"steps": 21'))
+    code, out, err = call_cli(capsys, "train", run, "--resume")
+    assert (code, out) == (3, "")
+    assert err.startswith(f"flowlab: {plan}: damaged (its content does not match its checksum); ")
 
 
 def cut(path: Path) -> None:
@@ -259,7 +328,7 @@ def forget_the_step(path: Path) -> None:
         ("resume.safetensors", lambda p: p.write_bytes(b""), "damaged"),
         ("resume.safetensors", swap_numbers, "does not fit its policy.json"),
         ("resume.safetensors", forget_the_step, "it does not tell its step"),
-        ("resume.safetensors", os.unlink, "nothing to resume (it has no resume.safetensors); delete it and start anew"),
+        ("resume.safetensors", os.unlink, "nothing to resume (it has no resume.safetensors); start anew, into"),
         ("run.json", lambda p: p.write_text("{"), "run.json: not valid JSON"),
         ("run.json", lambda p: p.write_text('{"steps": 3}'), "run.json: dataset: Field required"),
         ("run.json", os.unlink, "no run to resume (it has no run.json)"),

@@ -185,7 +185,7 @@ def test_bytes_that_are_no_text_are_damage(tmp_path: Path) -> None:
 
 
 def test_a_run_without_metrics_is_told(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no\.jsonl: cannot be read \(No such file"):
+    with pytest.raises(DataError, match=r"no\.jsonl: there is no such file; a training"):
         draw_training(tmp_path / "no.jsonl", tmp_path / "curve.png")
     (tmp_path / "cut.jsonl").write_text('{"kind": "tr')
     with pytest.raises(DataError, match=r"cut\.jsonl: holds no whole line yet"):

@@ -1,0 +1,107 @@
+"""Everything that would spoil the use of a training run, found before it does."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import torch
+
+from flowlab.checksums import CHECKSUM
+from flowlab.data.source import open_training_source
+from flowlab.errors import DataError
+from flowlab.evaluation.checkpoints import FOLDER
+from flowlab.evaluation.episode_log import EPISODES, read_results
+from flowlab.policies.checkpoint import (
+    CHECKPOINTS,
+    POLICY,
+    RESUME,
+    RUN,
+    build_policy,
+    has_begun,
+    load_policy,
+    read_resume,
+    read_run_config,
+    read_trained,
+)
+from flowlab.storage.validation import Finding
+from flowlab.training.metrics import METRICS
+from flowlab.untrusted import read_json
+from flowlab.viz.training_metrics import metrics_lines
+
+
+def has_checksums(run: Path) -> bool:
+    """Whether a run's files tell their checksums; those of earlier versions do not, so that damage may not be found."""
+    return CHECKSUM in read_json(run / POLICY)
+
+
+def validate_run(path: Path) -> Iterator[Finding]:
+    """Every finding about a training run; none if it is sound, be it finished or not.
+
+    The policy must be installed here, as for its use.
+    """
+    checks: list[Callable[[], None]] = [lambda: _check_begun(path), lambda: _check_plan(path)]
+    checks += [lambda w=w: _check_checkpoint(w) for w in sorted((path / CHECKPOINTS).glob("step-*.safetensors"))]  # type: ignore[misc]
+    checks += [lambda: _check_resume(path), lambda: _check_metrics(path)]
+    checks += [lambda e=e: _check_episodes(e) for e in sorted((path / FOLDER).glob(f"*/{EPISODES}"))]  # type: ignore[misc]
+    seen = set()
+    for check in checks:
+        try:
+            check()
+        except DataError as error:
+            place, separator, problem = str(error).partition(": ")
+            finding = Finding(place, problem) if separator else Finding(str(path), place)
+            if finding not in seen:  # what is wrong with policy.json, all that is read with it meets
+                seen.add(finding)
+                yield finding
+
+
+def _check_begun(path: Path) -> None:
+    if not has_begun(path):
+        raise DataError(f"{path}: a run that has not begun yet; give the command that began it again")
+    read_trained(path)
+
+
+def _check_plan(path: Path) -> None:
+    """The plan, and the dataset that it is about."""
+    planned, trained = read_run_config(path), read_trained(path)
+    if not planned.dataset.exists():
+        raise DataError(f"{path / RUN}: dataset: {planned.dataset} is not there; restore it, or change where it is")
+    if (found := open_training_source(planned.dataset).fingerprint) != trained.fingerprint:
+        raise DataError(
+            f"{planned.dataset}: its content is {found}, and {path} was trained on {trained.fingerprint}; restore it"
+        )
+
+
+def _check_checkpoint(weights: Path) -> None:
+    """Digest, shapes and numbers of a checkpoint, and its name."""
+    loaded = load_policy(weights)
+    if weights.name != f"step-{loaded.step:08d}.safetensors":
+        raise DataError(f"{weights}: holds the weights after {loaded.step} steps; call it after them")
+    _check_finite(weights, loaded.policy.state_dict())
+
+
+def _check_resume(path: Path) -> None:
+    if not (path / RESUME).exists():  # whoever is done with training may delete it
+        return
+    step, groups = read_resume(path)
+    for name in ("policy", "average"):
+        build_policy(read_trained(path).policy, groups.get(name, {}), f"{path / RESUME}: does not fit {path / POLICY}")
+    for tensors in groups.values():
+        _check_finite(path / RESUME, tensors)
+    if step > read_run_config(path).steps:
+        raise DataError(f"{path / RESUME}: is of step {step}, beyond the last; restore it")
+
+
+def _check_finite(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
+    for name, values in tensors.items():
+        if values.is_floating_point() and not values.isfinite().all():
+            raise DataError(f"{path}: '{name}' has values that are not finite; delete it, or restore it")
+
+
+def _check_metrics(path: Path) -> None:
+    steps = [line.step for line in metrics_lines(path / METRICS)]
+    if steps != sorted(steps):
+        raise DataError(f"{path / METRICS}: its steps do not rise; restore it")
+
+
+def _check_episodes(path: Path) -> None:
+    read_results(path)
