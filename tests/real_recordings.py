@@ -57,6 +57,12 @@ def opened(path: Path, **settings: Any) -> Recording:
     return open_recording(path, RecordingSettings(**settings), task="pour", seed=3)
 
 
+def said(recording: Recording, about: str) -> str:
+    """What the only check of something says."""
+    (check,) = [c for c in recording.extras["checks"] if c["about"] == about]
+    return str(check["says"])
+
+
 def assert_frames(recording: Recording, rows: list[int], *, exact_color: bool = True) -> None:
     """Row k of the recording is frame ``rows[k]`` of :func:`colors` and :func:`counts`."""
     assert len(recording) == len(rows)

@@ -28,7 +28,7 @@ def facts_of(one: InspectedRecording) -> dict[str, Any]:
         "state_width": found.state_width,
         "action_width": found.action_width,
         "bad_frames": [[b.name, b.reason] for b in found.bad],
-        "notes": list(found.notes),
+        "checks": [check.to_json() for check in found.checks],
         "problem": found.problem,
     }
 
@@ -65,8 +65,8 @@ def _known(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "bad frame", f"{name}: {reason}"
     if len(facts["bad_frames"]) > _SHOWN:
         yield "bad frames", f"{len(facts['bad_frames']) - _SHOWN} more; --json lists all"
-    for note in facts["notes"]:
-        yield "note", note
+    for check in facts["checks"]:
+        yield check["verdict"], f"{check['about']}: {check['says']}"
 
 
 def _gaps(gaps: list[list[float]]) -> str:

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64
 from flowlab.config import SettingsError
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.verdicts import Check
 from flowlab.registry import READERS, Plugin
 from flowlab.text import shown
 
@@ -61,8 +62,8 @@ class Streams:
     """What the layout itself tells of calibration, and where it says so; the first wins."""
     registered: bool | None = None
     """Whether depth is seen from the color camera; None where the layout does not say."""
-    notes: tuple[str, ...] = ()
-    """What a user should know, a sentence each."""
+    checks: tuple[Check, ...] = ()
+    """What the reader looked at, and what came of it."""
 
 
 @runtime_checkable

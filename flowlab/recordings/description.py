@@ -13,6 +13,7 @@ from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.parsing import RecordingSettings, parse_recording
 from flowlab.recordings.sync import find_gaps, sampling_rate
+from flowlab.recordings.verdicts import Check, raise_refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,8 @@ class RecordingDescription:
     state_width: int
     action_width: int
     bad: tuple[BadFrame, ...]
-    notes: tuple[str, ...]
+    checks: tuple[Check, ...]
+    """What was looked at, and what came of it."""
     problem: str | None
     """Why it cannot be opened as it is; None where it can."""
 
@@ -68,6 +70,7 @@ def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
         camera = source.frame_processor(settings).camera
         frame_size = camera.width, camera.height
         source.check_bad_frames(settings)
+        raise_refused(path, source.checks)
     except DataError as error:
         problem = str(error)
     rows = source.rows()
@@ -90,7 +93,7 @@ def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
         state_width=rows.state.shape[1],
         action_width=rows.action.shape[1],
         bad=seen.bad,
-        notes=streams.notes,
+        checks=source.checks,
         problem=problem,
     )
 

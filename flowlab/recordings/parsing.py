@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,11 +13,13 @@ from pydantic import Field
 from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
+from flowlab.recordings.checking import check_recording
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
 from flowlab.recordings.sample_files import load_samples
 from flowlab.recordings.sync import last_sample, nearest_sample
+from flowlab.recordings.verdicts import Check
 
 
 class RecordingSettings(Settings):
@@ -56,7 +59,7 @@ class AlignedSamples:
     """How the action was found, in words."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ParsedRecording:
     """A recording whose layout is understood."""
 
@@ -66,6 +69,11 @@ class ParsedRecording:
     metadata: Metadata
     origin: Mapping[str, str]
     frame_check: FrameCheck
+
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """What was looked at, and what came of it; what is refused is among them."""
+        return (*self.streams.checks, *check_recording(self))
 
     @property
     def write_to(self) -> str:

@@ -14,6 +14,7 @@ from flowlab.recordings.frame_check import FrameCheck
 from flowlab.recordings.frame_processing import FrameProcessor
 from flowlab.recordings.parsing import AlignedSamples, ParsedRecording, RecordingSettings, parse_recording
 from flowlab.recordings.sync import find_gaps
+from flowlab.recordings.verdicts import raise_refused
 from flowlab.records import Demonstration, Frame
 from flowlab.text import natural_key
 
@@ -99,6 +100,7 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     source = parse_recording(Path(path), settings)
     processor = source.frame_processor(settings)
     source.check_bad_frames(settings)
+    raise_refused(path, source.checks)
     rows = source.rows()
     success = np.zeros(len(rows.clock_s), bool)
     success[-1] = source.metadata.success
@@ -127,9 +129,6 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
 def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSamples) -> dict[str, Any]:
     """Where a recording comes from, as JSON values."""
     seen, streams = source.frame_check, source.streams
-    depth = "registered to color by flowlab" if processor.registration is not None else "registered to color"
-    if processor.registration is None and streams.registered is None:
-        depth = "taken as registered to color: same size, nothing said"
     return {
         "source": source.path.name if source.path.is_absolute() else source.path.as_posix(),
         "reader": source.reader.name,
@@ -137,11 +136,10 @@ def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSam
         "bad_frames": [[b.name, b.reason] for b in seen.bad],
         "gaps_s": [list(gap) for gap in find_gaps(rows.clock_s - rows.clock_s[0])],
         "max_sync_error_s": {k: float(off.max()) for k, off in seen.sync_s.items() if len(off)},
-        "depth": depth,
         "depth_unit_m": processor.depth_unit_m,
         "shrunk_by": processor.factor,
         "origin": dict(sorted(source.origin.items())),
         "world": "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame",
         "action": rows.action_source,
-        "notes": list(streams.notes),
+        "checks": [check.to_json() for check in source.checks],
     }

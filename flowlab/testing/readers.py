@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from flowlab.errors import FlowlabError
+from flowlab.recordings import verdicts
 from flowlab.recordings.base import BadImage, ImageStream, Reader, SampleStream, Streams, load_readers
 from flowlab.recordings.image_files import COLOR_SUFFIXES, check_depth
 from flowlab.recordings.metadata import FILE_NAME
@@ -103,7 +104,9 @@ def check_streams(make: MakeReader, recording: Path) -> None:
         _check_samples(samples)
     for where, _ in streams.known:
         require(isinstance(where, str) and where, "known must say where it was found, in words")
-    require(all(isinstance(n, str) and n for n in streams.notes), "notes must be sentences")
+    require(
+        all(isinstance(c, verdicts.Check) and c.about and c.says for c in streams.checks), "checks must say something"
+    )
 
 
 @_promise

@@ -19,6 +19,7 @@ from real_recordings import (
     colors,
     counts,
     opened,
+    said,
     write_folder,
     write_png,
     write_yaml,
@@ -303,7 +304,7 @@ def test_depth_is_registered_by_the_cameras(tmp_path: Path) -> None:
     keys = {"depth_intrinsics": DEPTH_K, "T_color_depth": np.eye(4).tolist()}
     recording = opened(write_small_depth(tmp_path / "rec", **keys))
     np.testing.assert_array_equal(recording.frame(0).depth, np.full((24, 32), np.float32(0.8)))
-    assert recording.extras["depth"] == "registered to color by flowlab"
+    assert said(recording, "registration") == "depth is registered to color by flowlab"
 
 
 def test_a_transform_that_loses_all_depth_is_refused(tmp_path: Path) -> None:

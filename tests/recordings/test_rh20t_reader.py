@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from real_recordings import K, assert_frames, colors, counts, opened, write_png, write_yaml
+from real_recordings import K, assert_frames, colors, counts, opened, said, write_png, write_yaml
 from scipy.spatial.transform import Rotation
 
 from flowlab.errors import DataError
@@ -67,7 +67,7 @@ def test_an_episode_is_read_with_its_calibration(episode: Path, tmp_path: Path) 
     assert_frames(recording, list(range(6)))
     np.testing.assert_allclose(recording.time_s, (MS - MS[0]) / 1000, atol=1e-6)
     np.testing.assert_array_equal(recording.camera.K, K)
-    assert recording.extras["depth"] == "registered to color"
+    assert said(recording, "registration") == "depth is registered to color, as the layout says"
     assert recording.extras["max_sync_error_s"]["depth"] == pytest.approx(0.003, abs=1e-5)
     assert recording.extras["origin"]["depth_unit_m"] == "the custom of RH20T"
 
@@ -129,7 +129,7 @@ def test_an_l515_counts_quarter_millimeters(tmp_path: Path) -> None:
 def test_what_is_missing_is_said(episode: Path, tmp_path: Path) -> None:
     (episode / "timestamp.txt").write_text("1700")
     about = describe(episode, RecordingSettings())
-    assert about.notes == ("its calibration calib/1700 is not beside it",)
+    assert ("calibration", "its calibration calib/1700 is not beside it") in [(c.about, c.says) for c in about.checks]
     assert about.problem is not None
     assert "intrinsics: {width: 32" in about.problem
 

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from real_recordings import INTRINSICS, STEPS, WIDTH, K, assert_frames, colors, counts, opened, write_yaml
+from real_recordings import INTRINSICS, STEPS, WIDTH, K, assert_frames, colors, counts, opened, said, write_yaml
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -154,7 +154,7 @@ def test_every_kind_of_recording_is_read(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(recording.time_s, np.arange(STEPS) / 10, atol=1e-6)
     np.testing.assert_array_equal(recording.state, np.arange(7) + 3 * np.arange(STEPS)[:, None])
     assert recording.extras["reader"] == "ros"
-    assert recording.extras["depth"] == "registered to color"
+    assert said(recording, "registration") == "depth is registered to color, as the layout says"
     assert recording.extras["depth_unit_m"] == 0.001
     assert recording.extras["origin"]["intrinsics"] == "/camera/color/camera_info"
     assert recording.extras["max_sync_error_s"]["depth"] == pytest.approx(0.002, abs=1e-5)
@@ -212,7 +212,7 @@ def test_stamps_from_another_clock_are_not_taken(tmp_path: Path) -> None:
     write_yaml(tmp_path / "rec.yaml", topics={"state": "/gripper"})
     recording = opened(path)
     np.testing.assert_array_equal(recording.state[:, 0], np.arange(STEPS))
-    assert any("another clock" in note for note in recording.extras["notes"])
+    assert any("another clock" in check["says"] for check in recording.extras["checks"])
 
 
 def test_messages_recorded_out_of_order_are_sorted(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_two_cameras_must_be_told_apart(tmp_path: Path) -> None:
     given = write_yaml(tmp_path / "c.yaml", topics={"color": "/right/color/image_raw"})
     recording = opened(path, calibration=given)
     assert_frames(recording, list(range(STEPS)))
-    notes = recording.extras["notes"]
+    notes = [check["says"] for check in recording.extras["checks"]]
     assert "/right/aligned_depth_to_color/image_raw" in notes[0], "the depth of the same camera"
 
 
@@ -314,7 +314,7 @@ def test_unregistered_depth_asks_for_the_transform(tmp_path: Path) -> None:
     given = write_yaml(tmp_path / "c.yaml", T_color_depth=np.eye(4).tolist())
     recording = opened(path, calibration=given)
     assert_frames(recording, list(range(STEPS)))
-    assert recording.extras["depth"] == "registered to color by flowlab"
+    assert said(recording, "registration") == "depth is registered to color by flowlab"
     assert recording.extras["origin"]["depth_intrinsics"] == "/camera/depth/camera_info"
 
 

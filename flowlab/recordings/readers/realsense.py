@@ -10,6 +10,7 @@ from flowlab.limits import MAX_ARRAY_BYTES
 from flowlab.recordings.base import Streams
 from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.readers.plain import open3d_calibration, read_folder
+from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 from flowlab.untrusted import check_regular, read_json
 
@@ -44,7 +45,7 @@ class RealSenseReader:
         lost = _lost(folder, len(streams.color), fps)
         return Streams(
             streams.color, streams.depth, known=known, registered=True,
-            notes=("times are frame numbers over the frame rate", *lost),
+            checks=(Check("clock", Verdict.ASSUMED, "times are frame numbers over the frame rate"), *lost),
         )  # fmt: skip
 
 
@@ -146,12 +147,13 @@ def _depth_of(color: Path) -> Path:
     return color.parent.with_name("depth") / f"{color.stem}.png"
 
 
-def _lost(folder: Path, frames: int, fps: float) -> tuple[str, ...]:
-    """A note where the bag is longer than its frames."""
+def _lost(folder: Path, frames: int, fps: float) -> tuple[Check, ...]:
+    """A doubt where the bag is longer than its frames."""
     values = read_json(folder / "intrinsic.json")
     length_us = values.get("stream_length_usec", 0) if isinstance(values, dict) else 0
     length_s = length_us / 1e6 if isinstance(length_us, int | float) else 0.0
     expected = int(length_s * fps)
     if frames >= 0.95 * expected:
         return ()
-    return (f"{frames} frames came of about {expected} in {length_s:.1f} s; the others were dropped or had no partner",)
+    says = f"{frames} frames came of about {expected} in {length_s:.1f} s; the others were dropped or had no partner"
+    return (Check("frames", Verdict.DOUBTFUL, says),)

@@ -19,6 +19,7 @@ from flowlab.recordings.image_files import COLOR_SUFFIXES, color_stream, depth_s
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, check_rigid
 from flowlab.recordings.readers.safe_pickle import pickled_numbers
 from flowlab.recordings.sample_files import to_float32
+from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut, is_plain_name, shown
 from flowlab.untrusted import read_json, read_text
 
@@ -48,7 +49,7 @@ class RH20TReader:
         stop_s = float(about["finish_time"]) / 1000 if "finish_time" in about else np.inf
         color, color_s = _timed(folder / "color", COLOR_SUFFIXES, stop_s)
         depth, depth_s = _timed(folder / "depth", (".png",))
-        calibration, notes = _calibration(episode, serial, about)
+        calibration, checks = _calibration(episode, serial, about)
         success = {"success": float(about["rating"]) > 1} if "rating" in about else {}
         known = Metadata(depth_unit_m=0.00025 if "f" in serial else 0.001, **success)
         return Streams(
@@ -57,7 +58,7 @@ class RH20TReader:
             state=_state([folder, episode]),
             known=(*calibration, ("the custom of RH20T", known)),
             registered=True,
-            notes=notes,
+            checks=checks,
         )
 
 
@@ -140,7 +141,7 @@ def _rows(files: list[Path]) -> np.ndarray:
 
 def _calibration(
     episode: Path, serial: str, about: dict[str, Any]
-) -> tuple[tuple[tuple[str, Metadata], ...], tuple[str, ...]]:
+) -> tuple[tuple[tuple[str, Metadata], ...], tuple[Check, ...]]:
     """Intrinsics and pose of a camera; the world is the calibration marker."""
     stamp = episode / "timestamp.txt"
     words = read_text(stamp, _MAX_ROW_BYTES).split() if stamp.is_file() else []
@@ -151,7 +152,7 @@ def _calibration(
         raise DataError(f"{episode}: its calibration is called {shown(name)}, expected the name of a folder in calib/")
     folder = next((f for p in list(episode.parents)[:3] if (f := p / "calib" / str(name)).is_dir()), None)
     if folder is None:
-        return (), (f"its calibration calib/{name} is not beside it",)
+        return (), (Check("calibration", Verdict.DOUBTFUL, f"its calibration calib/{name} is not beside it"),)
     values: dict[str, Any] = {}
     K = pickled_numbers(folder / "intrinsics.npy", serial)
     if K is not None:
@@ -161,8 +162,8 @@ def _calibration(
     T_cam_marker = pickled_numbers(folder / "extrinsics.npy", serial)
     if T_cam_marker is not None:
         values["T_world_cam"] = _pose(folder / "extrinsics.npy", serial, T_cam_marker)
-    note = "the world is the marker of the calibration" if T_cam_marker is not None else "its pose is not calibrated"
-    return ((f"calib/{name}", Metadata(**values)),), (note,)
+    says = "the world is the marker of the calibration" if T_cam_marker is not None else "its pose is not calibrated"
+    return ((f"calib/{name}", Metadata(**values)),), (Check("world", Verdict.OK, says),)
 
 
 def _pose(file: Path, serial: str, T_cam_marker: np.ndarray) -> list[list[float]]:

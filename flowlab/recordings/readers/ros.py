@@ -22,6 +22,7 @@ from flowlab.recordings.readers.ros_messages import (
     message_numbers,
     relative_pose,
 )
+from flowlab.recordings.verdicts import Check, Verdict
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -57,9 +58,10 @@ class ROSReader:
         own_clock = not any(_is_off(i) for i in indices.values())
         streams = {t: _Topic(bag, t, i, own_clock) for t, i in indices.items()}
         registered, known = _calibration(bag, topics)
-        notes = [f"topics: {', '.join(topics.all())}"]
+        checks = [Check("topics", Verdict.OK, f"read are {', '.join(topics.all())}")]
         if not own_clock:
-            notes.append("the messages' stamps are from another clock, so the times of recording are taken")
+            says = "the messages' stamps are from another clock, so the times of recording are taken"
+            checks.append(Check("clock", Verdict.ASSUMED, says))
         return Streams(
             streams[topics.color].pictures(),
             streams[topics.depth].pictures(),
@@ -67,7 +69,7 @@ class ROSReader:
             action=() if topics.action is None else (streams[topics.action].samples("action"),),
             known=(*known, _unit(bag, topics.depth)),
             registered=registered,
-            notes=tuple(notes),
+            checks=tuple(checks),
         )
 
 

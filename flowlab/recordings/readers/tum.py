@@ -8,6 +8,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.metadata import Intrinsics, Metadata
+from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import is_path_inside, shown
 from flowlab.untrusted import read_text
 
@@ -55,13 +56,13 @@ class TUMReader:
             known.append((f"TUM RGB-D's calibration of {camera}", Metadata(intrinsics=KINECTS[camera])))
         files = [[path / entry[1] for entry in entries] for entries in (color, depth)]
         times = [np.array([float(entry[0]) for entry in entries]) for entries in (color, depth)]
-        moving = "the camera moves in it (groundtruth.txt), and is taken as fixed"
+        moving = Check("camera", Verdict.DOUBTFUL, "it moves (groundtruth.txt), and is taken as fixed")
         return Streams(
             color_stream(files[0], times[0]),
             depth_stream(files[1], times[1]),
             known=tuple(known),
             registered=True,
-            notes=(moving,) if (path / "groundtruth.txt").is_file() else (),
+            checks=(moving,) if (path / "groundtruth.txt").is_file() else (),
         )
 
 

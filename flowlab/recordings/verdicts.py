@@ -1,0 +1,48 @@
+"""What was looked at in a recording, and what came of it: said in the dry run, stored with the episode."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from flowlab.errors import DataError
+
+
+class Verdict(StrEnum):
+    """What came of looking at something, the best first."""
+
+    OK = "ok"
+    """It is stated, and the evidence agrees; or it was looked at, and nothing is wrong."""
+    ASSUMED = "assumed"
+    """Nothing states it, and what is customary was taken."""
+    DOUBTFUL = "doubtful"
+    """Something speaks against it, too little to refuse the recording."""
+    REFUSED = "refused"
+    """It cannot be as it is said, or is not known and must be: the recording is not used."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """What came of looking at one thing."""
+
+    about: str
+    """What was looked at, in a word or two: ``clock``, ``depth unit``."""
+    verdict: Verdict
+    says: str
+    """What was found, and by what evidence; of what is refused also what to write, and where."""
+
+    def to_json(self) -> dict[str, str]:
+        """JSON values."""
+        return {"about": self.about, "verdict": self.verdict.value, "says": self.says}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Check":
+        """The inverse of :meth:`to_json`."""
+        return cls(str(values["about"]), Verdict(values["verdict"]), str(values["says"]))
+
+
+def raise_refused(path: object, checks: Iterable[Check]) -> None:
+    """Raise :class:`DataError` with everything that is refused, if anything is."""
+    refused = [f"{f.about}: {f.says}" for f in checks if f.verdict is Verdict.REFUSED]
+    if refused:
+        raise DataError(f"{path}: {'; '.join(refused)}")
