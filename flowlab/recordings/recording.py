@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 
 from flowlab.errors import DataError, UsageError
-from flowlab.recordings.base import BadImage, Reader, Streams, expected_layouts, load_readers, recognizes
+from flowlab.recordings.base import (
+    BadImage,
+    Reader,
+    Streams,
+    channel_names,
+    expected_layouts,
+    load_readers,
+    recognizes,
+)
 from flowlab.recordings.description import RecordingDescription, StreamInfo, describe
 from flowlab.recordings.frame_check import FrameCheck
 from flowlab.recordings.frame_processing import FrameProcessor
@@ -141,5 +149,7 @@ def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSam
         "origin": dict(sorted(source.origin.items())),
         "world": "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame",
         "action": rows.action_source,
+        "state_names": channel_names(streams.state),
+        "action_names": channel_names(streams.action),
         "checks": [check.to_json() for check in source.checks],
     }
