@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64
 
 from flowlab.config import SettingsError
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
+from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.verdicts import Check
 from flowlab.registry import READERS, Plugin
@@ -210,7 +211,8 @@ def choose_reader(path: Path, name: str | None = None) -> Reader:
         raise UsageError(f"{path}: the readers {names} both recognize it; choose one with --reader or the setting "
                          "recording.reader")  # fmt: skip
     if not able:
-        raise DataError(f"{path}: not a recording flowlab knows; looked for {expected_layouts(readers)}")
+        says = foreign_format(path) or f"not a recording flowlab knows; looked for {expected_layouts(readers)}"
+        raise DataError(f"{path}: {says}")
     return able[0]
 
 

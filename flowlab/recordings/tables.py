@@ -27,7 +27,9 @@ _UNITS = {
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
     "nanoseconds": 1e-9, "nanos": 1e-9,
 }  # fmt: skip
-_UNIT = re.compile(rf"[\s_\[\](){{}}/.:-]+({'|'.join(sorted(_UNITS, key=len, reverse=True))})[\])}}\s]*$", re.IGNORECASE)
+_UNIT = re.compile(
+    rf"[\s_\[\](){{}}/.:-]+({'|'.join(sorted(_UNITS, key=len, reverse=True))})[\])}}\s]*$", re.IGNORECASE
+)
 _ROSBAG_NS = 1e17
 """``rostopic echo -p`` writes ``%time`` in nanoseconds since 1970; in any other unit that would be beyond this."""
 _LIKE_A_CLOCK = 5
@@ -108,7 +110,9 @@ def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -
     rows = []
     for n, row in cells:
         if len(row) != width or not all(_is_number(x) for k, x in enumerate(row) if k not in text):
-            comma = "; its numbers must have a decimal point, and no sign between thousands" * any("," in x for x in row)
+            comma = "; its numbers must have a decimal point, and no sign between thousands" * any(
+                "," in x for x in row
+            )
             raise DataError(f"{path}: line {n} is not {width} numbers: {shown(' '.join(row))}{comma}")
         rows.append([np.nan if k in text else float(x) for k, x in enumerate(row)])
     return Table(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text))
@@ -182,7 +186,7 @@ def _check_meaning(
     table: Table, name: str, rest: Sequence[int], times: Sequence[int], color_s: np.ndarray, timed: bool
 ) -> None:
     """Refuse columns that are no numbers of a robot, or may be none, with what to write."""
-    doubtful = {k: "is a time, too" for k in times[1:]}
+    doubtful = dict.fromkeys(times[1:], "is a time, too")
     doubtful |= {k: "holds text" for k in rest if k in table.text}
     doubtful |= {k: "counts the rows" for k in rest if table.names and _plain(table.names[k]) in _COUNTS
                  and _rises(table.values[:, k])}  # fmt: skip

@@ -8,7 +8,6 @@ from flowlab.config import PlainName, Settings
 from flowlab.errors import DataError, UsageError
 from flowlab.text import natural_key
 
-
 CONTENT = "content"
 """Where an episode's extras say what its recording is known by."""
 

@@ -49,7 +49,9 @@ class ROSReader:
     def probe(self, path: Path) -> bool:
         """Whether it is a recording of ROS, and none of the RealSense SDK."""
         if path.is_dir():
-            return (path / "metadata.yaml").is_file() and any(f.suffix in (".mcap", ".db3") for f in path.iterdir())
+            return (path / "metadata.yaml").is_file() and any(
+                f.name.endswith((".mcap", ".db3", ".mcap.zstd", ".db3.zstd")) for f in path.iterdir()
+            )
         known = path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
         return known and path.is_file()
 
@@ -144,7 +146,8 @@ def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int
         return topics[0]
     where = f"{bag.path.with_suffix('.yaml').name if bag.path.is_file() else FILE_NAME} or the calibration file"
     if not topics:
-        every = ", ".join(f"{t} ({kind})" for t, kind in sorted(bag.types().items())) or "no topic"
+        kinds = bag.types() | {t: f"{bag.encoding(t)} pictures" for t in counts}
+        every = ", ".join(f"{t} ({kind})" for t, kind in sorted(kinds.items())) or "no topic"
         raise DataError(f"{bag.path}: no topic is known as {what}; it has {every}; name one in {where}: "
                         f"'topics: {{{what}: ...}}'")  # fmt: skip
     some = ", ".join(f"{t} ({counts[t]} pictures)" for t in topics)
