@@ -56,6 +56,6 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_lerobot, f"is a LeRobot data set, which is not read; {_PLAIN}"),
     (_seven_scenes, "has the layout of 7-Scenes, which is not read; move *.color.png into color/ and *.depth.png into "
                     "depth/, with a recording.yaml (depth_unit_m: 0.001, fps: 30, intrinsics)"),
-    (_stray_scanner, "is of Stray Scanner, which keeps color as a video; unpack it with 'mkdir color; ffmpeg -i rgb.mp4 "
+    (_stray_scanner, "is of Stray Scanner, which keeps color as a video; unpack it with 'mkdir color; ffmpeg -i rgb.mp4 "  # noqa: E501
                      "-start_number 0 color/%06d.png', and add a recording.yaml"),
 )  # fmt: skip

@@ -10,6 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 from flowlab.errors import DataError
@@ -63,7 +64,7 @@ def wait_until_quiet(path: Path) -> None:
     times = sorted(f.changed_s for f in files_below(path))[-5:]
     if not times:
         return
-    pauses = [b - a for a, b in zip(times, times[1:], strict=False)] or [0.0]
+    pauses = [b - a for a, b in pairwise(times)] or [0.0]
     quiet = min(max(_QUIET * max(pauses), _QUIET_S[0]), _QUIET_S[1])
     age = max(time.time() - times[-1], 0.0)  # of a server whose clock is ahead: as if it were from now
     if age < quiet:

@@ -140,7 +140,7 @@ def _splitter(path: Path, lines: Sequence[str]):  # type: ignore[no-untyped-def]
         return cells
     several = any("." in x and _is_number(x) for x in found)
     if several or all(re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", x) for x in with_comma):
-        raise DataError(f"{path}: {shown(with_comma[0])} may have a decimal comma or a sign between thousands; write the "
+        raise DataError(f"{path}: {shown(with_comma[0])} may have a decimal comma or a sign between thousands; write the "  # noqa: E501
                         "numbers with a decimal point, and no sign between thousands")  # fmt: skip
     return lambda line: [x.replace(",", ".") if re.fullmatch(r"[+-]?\d*,\d+(?:[eE].*)?", x) else x for x in cells(line)]
 
@@ -150,7 +150,7 @@ def _of_commas(path: Path, lines: Sequence[str], cells):  # type: ignore[no-unty
     numbers = [line for line in lines if line[:1] in "+-.0123456789"]
     both = [x for x in numbers if re.search(r"\d,\d", x) and re.search(r"\d,?[ \t]+[+-]?\.?\d", x)]
     if both:
-        raise DataError(f"{path}: the line {shown(both[0])} has commas within its numbers and space between them: write "
+        raise DataError(f"{path}: the line {shown(both[0])} has commas within its numbers and space between them: write "  # noqa: E501
                         "the numbers with a decimal point, or separate them by ';'")  # fmt: skip
     return cells
 
@@ -207,7 +207,7 @@ def _check_meaning(
         )
         if table.path.suffix.lower() == ".npy":
             advice = (
-                f"if it is the time, write it into a file of its own, named as '{name}_times', and the rest without it; "
+                f"if it is the time, write it into a file of its own, named as '{name}_times', and the rest without it; "  # noqa: E501
                 f"if it is a number of the {name}, write the array as a table (.csv) with a line of names"
             )
     raise DataError(f"{table.path}: column {cut(called)} {why}; {cut(advice, 600)}")

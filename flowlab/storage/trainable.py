@@ -19,8 +19,8 @@ def training_problems(dataset: Dataset) -> Iterator[str]:
         return
     if not widths.action:
         yield (
-            "the episodes have no actions, so no policy can be trained on them; name the robot's state or actions in the "
-            "recordings ('state', 'action' in recording.yaml, 'topics' of a bag), and run the same command again"
+            "the episodes have no actions, so no policy can be trained on them; name the robot's state or actions in "
+            "the recordings ('state', 'action' in recording.yaml, 'topics' of a bag), and run the same command again"
         )
     if problem := dataset.provenance.width_problem(state=widths.state, action=widths.action or None):
         yield f"flowlab.json: provenance.{problem}"

@@ -90,7 +90,9 @@ class ArraysReader:
         time_s = _times(store, len(color), given)
         K = store.load("intrinsics")
         T = None if given.T_world_cam is not None else store.load("pose")
-        known = () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
+        known: tuple[tuple[str, Metadata], ...] = (
+            () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
+        )  # noqa: E501
         known += () if T is None else ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
             ImageStream(_called(names["color"], len(color)), time_s, partial(_color, store, color)),
@@ -200,7 +202,7 @@ def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
         raise DataError(f"{path}: '{name}' is {T.dtype} {cut(str(T.shape))}, expected numbers (4, 4); {advice}")
     every = T.reshape(-1, 4, 4).astype(float)
     if not np.allclose(every, every[0], rtol=0, atol=1e-6):
-        raise DataError(f"{path}: '{name}' changes from step to step: the camera moves, and is read as fixed; {advice}, or "
+        raise DataError(f"{path}: '{name}' changes from step to step: the camera moves, and is read as fixed; {advice}, or "  # noqa: E501
                         "record one that does")  # fmt: skip
     if name not in POSES:
         raise DataError(f"{path}: '{name}' does not say whether it maps camera to world or world to camera; {advice}")

@@ -49,11 +49,12 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
     for name, where in seen.items():
         by_presence[tuple(where)].append(name)
     groups, checks = [], []
-    for where, names in by_presence.items():
+    for where, together in by_presence.items():
+        names = list(together)
         values = to_float32(np.array([[rows[k][name] for name in names] for k in where]))
         finite = np.isfinite(values)
         if lost := [name for name, known in zip(names, finite.T, strict=True) if not known.any()]:
-            raise DataError(f"{place}: no message has a number for {cut(', '.join(lost))}; record these joints, or choose "
+            raise DataError(f"{place}: no message has a number for {cut(', '.join(lost))}; record these joints, or choose "  # noqa: E501
                             "another topic, or none, with 'topics: {state: ...}'")  # fmt: skip
         whole = finite.all(1)
         if not whole.all():

@@ -206,7 +206,7 @@ def _unchosen(bag: RosBag, topics: ChosenTopics) -> list[Check]:
     joints = list(bag.topics(JOINTS))
     if topics.state is not None or not joints:
         return []
-    says = f"none is taken, for several topics may be it: {cut(', '.join(joints))}; choose one with 'topics: {{state: ...}}'"
+    says = f"none is taken, for several topics may be it: {cut(', '.join(joints))}; choose one with 'topics: {{state: ...}}'"  # noqa: E501
     return [Check("state", Verdict.DOUBTFUL, says)]
 
 
@@ -263,7 +263,7 @@ def _unnamed(place: str, what: str, messages: Sequence[Any]) -> JointGroup:
     whole = np.isfinite(values).all(1)
     if not whole.all():
         raise DataError(
-            f"{place}: {(~whole).sum()} of {len(whole)} messages hold what is no number; choose another topic, or none, "
+            f"{place}: {(~whole).sum()} of {len(whole)} messages hold what is no number; choose another topic, or none, "  # noqa: E501
             f"with 'topics: {{{what}: ...}}'"
         )
     return JointGroup((), np.flatnonzero(whole), values)
