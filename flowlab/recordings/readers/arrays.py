@@ -92,7 +92,7 @@ class ArraysReader:
         T = None if given.T_world_cam is not None else store.load("pose")
         known: tuple[tuple[str, Metadata], ...] = (
             () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
-        )  # noqa: E501
+        )
         known += () if T is None else ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
             ImageStream(_called(names["color"], len(color)), time_s, partial(_color, store, color)),

@@ -49,9 +49,9 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
     for name, where in seen.items():
         by_presence[tuple(where)].append(name)
     groups, checks = [], []
-    for where, together in by_presence.items():
+    for places, together in by_presence.items():
         names = list(together)
-        values = to_float32(np.array([[rows[k][name] for name in names] for k in where]))
+        values = to_float32(np.array([[rows[k][name] for name in names] for k in places]))
         finite = np.isfinite(values)
         if lost := [name for name, known in zip(names, finite.T, strict=True) if not known.any()]:
             raise DataError(f"{place}: no message has a number for {cut(', '.join(lost))}; record these joints, or choose "  # noqa: E501
@@ -61,7 +61,7 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
             says = f"{(~whole).sum()} of {len(whole)} messages hold no number for {_worst(names, finite)}: not used"
             checks.append(Check("state", Verdict.DOUBTFUL, says))
         names = [] if names[0].startswith("\0") else names
-        groups.append(JointGroup(tuple(names), np.array(where)[whole], values[whole]))
+        groups.append(JointGroup(tuple(names), np.array(places)[whole], values[whole]))
     if len(groups) > 1:
         listed = "; ".join(f"{cut(', '.join(g.names))} in {len(g.messages)}" for g in groups)
         says = f"the messages do not all have the same joints, so they are joined by name: {listed} messages"
