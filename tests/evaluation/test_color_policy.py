@@ -85,7 +85,7 @@ def trained(folder: Path, settings: SceneSettings) -> Path:
         dataset=folder, steps=1, train=(0,), held_out=(), threads=1, device="cpu", precision="fp32", logs=(),
         began_from=None,
     )  # fmt: skip
-    start_folder(folder, about, run)
+    start_folder(folder, about, run, {})
     save_weights(folder, Picture(spec()), 1)
     return folder
 
