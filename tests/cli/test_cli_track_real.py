@@ -214,7 +214,7 @@ def test_a_dry_run_names_gaps_bad_frames_and_what_is_missing(
     (folder / "times.txt").write_text("\n".join(times[:12] + [str(float(t) + 0.5) for t in times[12:]]))
     described = (folder / "recording.yaml").read_text().splitlines(keepends=True)
     (folder / "recording.yaml").write_text("".join(line for line in described if "intrinsics" not in line))
-    code, output, errors = call_cli(capsys, "track-real", tmp_path, "--dry-run", *SMALL)
+    code, output, errors = call_cli(capsys, "track-real", tmp_path, "--dry-run", "--estimate", *SMALL)
     assert code == 3
     assert "1 of 1 recordings cannot be used as they are" in errors
     assert "1 gaps, the longest of 0.60 s at 1.10 s" in output
