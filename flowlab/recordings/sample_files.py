@@ -8,47 +8,40 @@ from jaxtyping import Float32, Float64, Num
 
 from flowlab.array_files import load_array
 from flowlab.errors import DataError
-from flowlab.recordings.base import SampleStream
+from flowlab.recordings.base import ImageStream, SampleStream
+from flowlab.recordings.stamps import Timing
 from flowlab.text import cut, shown
 from flowlab.untrusted import read_text
 
 _TIME_COLUMNS = ("time", "time_s", "t", "timestamp", "timestamps")
 
 
-def load_times(path: Path) -> Float64[np.ndarray, "N"]:
-    """Times [s] of a file, one a line or as a numpy array; they must rise."""
-    time_s = _load(path)[1]
-    if time_s.shape[1] != 1:
-        raise DataError(f"{path}: has {time_s.shape[1]} numbers a line, expected one time in seconds")
-    return check_times(path, time_s[:, 0])
+def load_times(path: Path) -> tuple[Float64[np.ndarray, "N"], Timing]:
+    """Times of a file, one a line or as a numpy array, as they stand there, and what is known of them."""
+    _, time, integers = _load(path)
+    if time.shape[1] != 1:
+        raise DataError(f"{path}: has {time.shape[1]} numbers a line, expected one time")
+    return check_times(path, time[:, 0], integers)
 
 
-def check_times(path: Path, time_s: Num[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
-    """The same times, where they can be seconds and never fall."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        step = np.diff(time_s)
-    if not np.isfinite(time_s).all() or (step < 0).any():
-        at = int(np.argmax(~(np.append(0, step) >= 0)))
-        raise DataError(f"{path}: the times must rise, and entry {at + 1} ({time_s[at]}) does not")
-    if len(step) and np.median(step) > 10:
-        raise DataError(
-            f"{path}: the times must be in seconds; with a median of {np.median(step):g} between two they look like "
-            "milli-, micro- or nanoseconds"
-        )
-    return time_s.astype(np.float64)
+def check_times(path: Path, time: Num[np.ndarray, "N"], integers: bool) -> tuple[Float64[np.ndarray, "N"], Timing]:
+    """The same times, where they are finite; in which unit they are is decided elsewhere."""
+    if not np.isfinite(time).all():
+        at = int(np.argmin(np.isfinite(time)))
+        raise DataError(f"{path}: entry {at + 1} ({time[at]}) is no time")
+    return time.astype(np.float64), Timing(path.name, unit=None, integers=integers)
 
 
-def load_samples(
-    path: Path, name: str, times: Path | None, color_time_s: Float64[np.ndarray, "F"], write_to: str
-) -> SampleStream:
+def load_samples(path: Path, name: str, times: Path | None, color: ImageStream, write_to: str) -> SampleStream:
     """Rows of numbers: with times of their own (a file, or a first column ``time``), else one per color picture."""
-    header, values = _load(path)
+    header, values, _ = _load(path)
     own = None
     if header and header[0].lower() in _TIME_COLUMNS:
-        own, values = check_times(path, values[:, 0]), values[:, 1:]
+        whole = not (values[:, 0] % 1).any()
+        own, values = check_times(path, values[:, 0], whole), values[:, 1:]
     if times is not None:
         own = load_times(times)
-    where = color_time_s if own is None else own
+    where, timing = (color.time_s, color.timing) if own is None else own
     if len(where) != len(values):
         of = "times" if own is not None else "color pictures"
         raise DataError(
@@ -59,21 +52,21 @@ def load_samples(
     if not np.isfinite(rows).all():
         row = int(np.argmax(~np.isfinite(rows).all(1)))
         raise DataError(f"{path}: row {row + 1} holds a value that is not finite, or too large for float32")
-    return SampleStream(name, where, rows)
+    return SampleStream(name, where, rows, timing)
 
 
-def _load(path: Path) -> tuple[list[str], np.ndarray]:
-    """Names of columns (none where the file has none), and rows (N, D) float64."""
+def _load(path: Path) -> tuple[list[str], np.ndarray, bool]:
+    """Names of columns (none where the file has none), rows (N, D) float64, and whether all are integers."""
     if path.suffix.lower() != ".npy":
         return _parse(path, read_text(path))
     values = load_array(path)
     if values.dtype.kind not in "biuf":
         raise DataError(f"{path}: holds {cut(str(values.dtype))}, expected numbers")
-    return [], _table(path, values.astype(np.float64))
+    return [], _table(path, values.astype(np.float64)), values.dtype.kind in "iu"
 
 
-def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
-    """Names of columns and rows of numbers of a text."""
+def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray, bool]:
+    """Names of columns and rows of numbers of a text, and whether all are written as integers."""
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1)]
     rows = [(n, re.split(r"[,;\s]+", line.strip(",; "))) for n, line in lines if line and not line.startswith("#")]
     header: list[str] = []
@@ -85,7 +78,8 @@ def _parse(path: Path, text: str) -> tuple[list[str], np.ndarray]:
     for n, row in rows:
         if len(row) != width or not all(map(_is_number, row)):
             raise DataError(f"{path}: line {n} is not {width} numbers: {shown(' '.join(row))}")
-    return header, np.array([row for _, row in rows], np.float64)
+    integers = all(number.lstrip("+-").isdecimal() for _, row in rows for number in row)
+    return header, np.array([row for _, row in rows], np.float64), integers
 
 
 def _table(path: Path, values: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from flowlab.recordings.readers.ros_messages import (
     message_numbers,
     relative_pose,
 )
+from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -32,8 +33,6 @@ REGISTERED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_col
 """What the topics of depth that is seen from the color camera are called."""
 COMPRESSED = ("compressed", "compressedDepth")
 SDK_UNIT = "/option/Depth_Units/value"
-CLOCK_ERROR_S = 10.0
-"""Where stamps are farther than this from the times of recording, they are from another clock."""
 
 
 class ROSReader:
@@ -55,13 +54,9 @@ class ROSReader:
         bag = RosBag(path)
         topics = choose_topics(bag, given)
         indices = {topic: bag.index(topic) for topic in dict.fromkeys(topics.all())}
-        own_clock = not any(_is_off(i) for i in indices.values())
-        streams = {t: _Topic(bag, t, i, own_clock) for t, i in indices.items()}
+        streams = {t: _Topic(bag, t, i) for t, i in indices.items()}
         registered, known = _calibration(bag, topics)
-        checks = [Check("topics", Verdict.OK, f"read are {', '.join(topics.all())}")]
-        if not own_clock:
-            says = "the messages' stamps are from another clock, so the times of recording are taken"
-            checks.append(Check("clock", Verdict.ASSUMED, says))
+        read = Check("topics", Verdict.OK, f"read are {', '.join(topics.all())}")
         return Streams(
             streams[topics.color].pictures(),
             streams[topics.depth].pictures(),
@@ -69,7 +64,7 @@ class ROSReader:
             action=() if topics.action is None else (streams[topics.action].samples("action"),),
             known=(*known, _unit(bag, topics.depth)),
             registered=registered,
-            checks=tuple(checks),
+            checks=(read,),
         )
 
 
@@ -184,33 +179,22 @@ def _unit(bag: RosBag, depth: str) -> tuple[str, Metadata]:
     return "the custom of ROS (REP 118)", Metadata(depth_unit_m=depth_unit_of(bag.first(depth)))
 
 
-def _is_off(index: BagIndex) -> bool:
-    """Whether the stamps of a topic are from another clock than the recording."""
-    off = np.abs(index.measured_s - index.recorded_ns * 1e-9)
-    return bool(np.isfinite(off).any() and np.nanmedian(off) > CLOCK_ERROR_S)
-
-
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A topic in the order of time."""
+    """A topic in the order of recording."""
 
     bag: RosBag
     name: str
     index: BagIndex
-    own_clock: bool
-    """Whether the times are those that the messages say."""
 
-    def times(self) -> np.ndarray:
-        """When each message is from, in the order of recording [s]."""
-        recorded = self.index.recorded_ns * 1e-9
-        stamped = self.own_clock and np.isfinite(self.index.measured_s).all()
-        return self.index.measured_s if stamped else recorded
+    def timing(self) -> Timing:
+        """What is known of its stamps, which ROS has in seconds."""
+        return Timing(f"the stamps of {self.name}", overtaking=True, recorded_s=self.index.recorded_ns * 1e-9)
 
     def pictures(self) -> ImageStream:
         """Its messages as pictures."""
-        order = np.argsort(self.times(), kind="stable")
-        names = tuple(f"{self.name}[{i}]" for i in order)
-        return ImageStream(names, self.times()[order], partial(_picture, self, order))
+        names = tuple(f"{self.name}[{i}]" for i in range(len(self.index.measured_s)))
+        return ImageStream(names, self.index.measured_s, partial(_picture, self), self.timing())
 
     def samples(self, what: str) -> SampleStream:
         """Its messages as rows of numbers."""
@@ -221,10 +205,9 @@ class _Topic:
                 f"{self.bag.path}: the messages of {self.name} hold {' or '.join(map(str, widths))} numbers, expected "
                 f"the same number of each; choose another topic, or none, with 'topics: {{{what}: ...}}'"
             )
-        order = np.argsort(self.times(), kind="stable")
-        return SampleStream(what, self.times()[order], np.array(rows, np.float32)[order])
+        return SampleStream(what, self.index.measured_s, np.array(rows, np.float32), self.timing())
 
 
-def _picture(topic: _Topic, order: np.ndarray, i: int) -> np.ndarray:
-    """Decode the i-th picture of a topic in the order of time."""
-    return decode_image(topic.bag.message(topic.name, topic.index, int(order[i])))
+def _picture(topic: _Topic, i: int) -> np.ndarray:
+    """Decode the i-th picture of a topic in the order of recording."""
+    return decode_image(topic.bag.message(topic.name, topic.index, i))
