@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64
 from flowlab.config import SettingsError
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.recordings.metadata import Metadata
-from flowlab.recordings.stamps import Timing, UnclearStamps
+from flowlab.recordings.stamps import IN_SECONDS, Timing, UnclearStamps
 from flowlab.recordings.verdicts import Check
 from flowlab.registry import READERS, Plugin
 from flowlab.text import shown
@@ -35,7 +35,7 @@ class ImageStream:
     """When each was taken, on the clock of the recording [s]; from a reader in the unit that ``timing`` says."""
     read: Callable[[int], np.ndarray]
     """Decodes one: uint8 (H, W, 3) RGB, or depth counts (H, W). Raises :class:`BadImage`."""
-    timing: Timing = Timing()
+    timing: Timing = IN_SECONDS
     """What is known of the times."""
 
     def __len__(self) -> int:
@@ -50,7 +50,7 @@ class SampleStream:
     time_s: Float64[np.ndarray, "N"]
     """On the clock of the pictures [s]; from a reader in the unit that ``timing`` says."""
     values: Float32[np.ndarray, "N D"]
-    timing: Timing = Timing()
+    timing: Timing = IN_SECONDS
     """What is known of the times."""
 
 

@@ -1,6 +1,6 @@
 """One clock for all streams: every recording passes here, whatever its layout, before anything is paired."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, TypeVar
@@ -60,22 +60,23 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
     )
     units = [decide_unit(s.time_s, s.timing, fps=known.fps, stated=known.time_unit) for s in (color, depth)]
     if "frames" in units and units[0] != units[1]:
-        raise UnclearStamps(f"{color.timing.source} are {_called(units[0])}, {depth.timing.source} {_called(units[1])}; "
-                            "give the times of both in 'times' and 'depth_times'")  # fmt: skip
+        raise UnclearStamps(
+            f"{color.timing.source} are {_called(units[0])}, {depth.timing.source} {_called(units[1])}; "
+            "give the times of both in 'times' and 'depth_times'"
+        )
     clock = _PictureClock(units[0], units[1], float(color.time_s[0]), known.fps or 1.0)
     checks += _number_checks(clock, color, depth, (*state, *action), known)
     lag = known.state_offset_s or 0.0
-    timed = Streams(
-        _timed(color, clock.seconds(color.time_s, units[0])),
-        _timed(depth, clock.seconds(depth.time_s, units[1]) + (known.depth_offset_s or 0.0)),
-        *(tuple(_sample_timed(s, streams, color, clock, known, lag) for s in samples) for samples in (state, action)),
+    timed = replace(
+        streams,
+        color=_timed(color, clock.seconds(color.time_s, units[0])),
+        depth=_timed(depth, clock.seconds(depth.time_s, units[1]) + (known.depth_offset_s or 0.0)),
+        state=tuple(_sample_timed(s, streams, color, clock, known, lag) for s in state),
+        action=tuple(_sample_timed(s, streams, color, clock, known, lag) for s in action),
     )
     _check_overlap(timed)
     said = Check("clock", *_clock_words(streams, units, known))
-    return replace(
-        streams, color=timed.color, depth=timed.depth, state=timed.state, action=timed.action,
-        checks=(*streams.checks, said, *checks, *_step_checks(timed)),
-    )  # fmt: skip
+    return replace(timed, checks=(*streams.checks, said, *checks, *_step_checks(timed)))
 
 
 def _named(streams: Streams, known: Metadata) -> Iterator[tuple[str, tuple[ImageStream | SampleStream, float]]]:
@@ -88,7 +89,7 @@ def _named(streams: Streams, known: Metadata) -> Iterator[tuple[str, tuple[Image
 
 def _check_said(streams: Streams, known: Metadata) -> None:
     """Refuse what the user says of the clock where there is nothing that it could be said of."""
-    timings = [s.timing for s in (streams.color, streams.depth, *streams.state, *streams.action)]
+    timings = [streams.color.timing, streams.depth.timing, *(s.timing for s in (*streams.state, *streams.action))]
     if known.time_unit is not None and all(t.unit not in (None, known.time_unit) for t in timings):
         raise UnclearStamps(f"'time_unit: {known.time_unit}' is said, but {timings[0].source} are in "
                             f"{timings[0].unit} in this layout; leave it out")  # fmt: skip
@@ -170,19 +171,17 @@ def _number_checks(
         return ()
     stated = {"depth": known.depth_offset_s, "state": known.state_offset_s}
     found = [check_numbers(color.time_s, depth.time_s, "depth", stated["depth"] is not None)]
-    for s in samples:
-        if s.timing is not color.timing and _number_frames(clock, s):
-            found.append(check_numbers(color.time_s, s.time_s, s.name, stated["state"] is not None))
+    numbered = (s for s in samples if s.timing is not color.timing and _number_frames(clock, s))
+    found += (check_numbers(color.time_s, s.time_s, s.name, stated["state"] is not None) for s in numbered)
     return tuple(found)
 
 
 def _check_overlap(streams: Streams) -> None:
     """Refuse streams that were not recorded at the same time as the pictures."""
     color = streams.color.time_s
-    every = [("depth", streams.depth, "depth_offset_s")]
-    every += [(s.name, s, "state_offset_s") for s in (*streams.state, *streams.action)]  # type: ignore[misc]
-    for name, stream, key in every:
-        time_s = stream.time_s
+    every: list[tuple[str, np.ndarray, str]] = [("depth", streams.depth.time_s, "depth_offset_s")]
+    every += [(s.name, s.time_s, "state_offset_s") for s in (*streams.state, *streams.action)]
+    for name, time_s, key in every:
         if len(time_s) and max(time_s[0] - color[-1], color[0] - time_s[-1]) > _APART_S:
             raise UnclearStamps(
                 f"color lies between {color[0]:.15g} and {color[-1]:.15g} s, and {name} between {time_s[0]:.15g} and "
@@ -191,7 +190,7 @@ def _check_overlap(streams: Streams) -> None:
             )
 
 
-def _clock_words(streams: Streams, units: list[str], known: Metadata) -> tuple[Verdict, str]:
+def _clock_words(streams: Streams, units: Sequence[str], known: Metadata) -> tuple[Verdict, str]:
     """In which unit the stamps of pictures are, and how that is known."""
     found, verdict = [], Verdict.OK
     for name, stream, unit in (("color", streams.color, units[0]), ("depth", streams.depth, units[1])):
@@ -200,9 +199,8 @@ def _clock_words(streams: Streams, units: list[str], known: Metadata) -> tuple[V
             how = "as 'time_unit' says" if known.time_unit else "by how they step and where they begin"
             verdict = verdict if unit == "s" or known.time_unit else Verdict.ASSUMED
         found.append(f"{name}: {stream.timing.source} are {_called(unit)}, {how}")
-    for key in ("depth_offset_s", "state_offset_s"):
-        if getattr(known, key):
-            found.append(f"'{key}: {getattr(known, key):g}' is added")
+    offsets = {key: getattr(known, key) for key in ("depth_offset_s", "state_offset_s")}
+    found += (f"'{key}: {value:g}' is added" for key, value in offsets.items() if value)
     return verdict, "; ".join(found)
 
 
@@ -213,8 +211,9 @@ def _called(unit: str) -> str:
 def _step_checks(streams: Streams) -> Iterator[Check]:
     """Gaps, and instants that come twice, in every stream."""
     doubts, found = [], []
-    for name, stream in (("color", streams.color), ("depth", streams.depth), *((s.name, s) for s in streams.state)):
-        time_s, gaps = stream.time_s, find_gaps(stream.time_s)
+    every = [("color", streams.color.time_s), ("depth", streams.depth.time_s)]
+    for name, time_s in [*every, *((s.name, s.time_s) for s in streams.state)]:
+        gaps = find_gaps(time_s)
         ties = np.flatnonzero(np.diff(time_s) == 0)
         words = f"{name} at {sampling_rate(time_s):.3g} a second, {len(gaps) or 'no'} gap{'s' * (len(gaps) != 1)}"
         if len(ties):

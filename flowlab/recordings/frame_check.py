@@ -9,7 +9,10 @@ from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.frame_processing import Size
-from flowlab.recordings.sync import nearest_sample
+from flowlab.recordings.sync import nearest_sample, sampling_rate
+
+_NEAR = 0.55
+"""So many intervals away a sample may be that is the nearest of a stream without a loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +59,13 @@ def check_frames(
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
-    depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``; and
-    where its time does not lie after the frame before.
+    depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
+    an interval; and where its time does not lie after the frame before.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
+    max_sync_s = min(max_sync_s, _half(streams.color))
+    max_state = {s.name: min(max_state_s, max(_half(streams.color), _half(s))) for s in streams.state}
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
@@ -76,7 +81,7 @@ def check_frames(
         if fault is None and off[k] > max_sync_s:
             fault = BadFrame(name, f"no depth within {_ms(max_sync_s)}: the nearest is {_ms(off[k])} away")
         if fault is None:
-            fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state_s)
+            fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state)
         if fault is not None:
             bad.append(fault)
             continue
@@ -136,12 +141,18 @@ def _fault(name: str, look: _ImageCheck, usual: Size) -> BadFrame | None:
     return None
 
 
-def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: float) -> BadFrame | None:
+def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: Mapping[str, float]) -> BadFrame | None:
     """What is wrong where no sample of robot state is near enough; None if one is."""
     for stream, off in off_state.items():
-        if off[k] > max_state_s:
-            return BadFrame(name, f"no {stream} within {_ms(max_state_s)}: the nearest is {_ms(off[k])} away")
+        if off[k] > max_state_s[stream]:
+            return BadFrame(name, f"no {stream} within {_ms(max_state_s[stream])}: the nearest is {_ms(off[k])} away")
     return None
+
+
+def _half(stream: ImageStream | SampleStream) -> float:
+    """Half an interval of a stream, and as much more as intervals vary [s]; farther away is another frame's."""
+    rate = sampling_rate(stream.time_s)
+    return _NEAR / rate if 0 < rate < np.inf else np.inf
 
 
 def _ms(seconds: float) -> str:

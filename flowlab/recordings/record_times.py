@@ -65,13 +65,14 @@ def _typical(lag: Float64[np.ndarray, "N"]) -> float:
 
 
 def _drift(lags: Mapping[str, Float64[np.ndarray, "N"]]) -> tuple[float, str]:
-    """By how much the lag of a stream changes from its first quarter to its last, and that stream."""
-    changes = {}
+    """By how much the lag of a stream changes from its first quarter to its last, others' less, and that stream."""
+    changes: dict[str, float] = {}
     for name, lag in lags.items():
         part = max(len(lag) // 4, 1)
-        changes[name] = abs(_typical(lag[-part:]) - _typical(lag[:part]))
-    late = max(changes, key=lambda name: changes[name])
-    return changes[late], late
+        changes[name] = _typical(lag[-part:]) - _typical(lag[:part])
+    usual = float(np.median(list(changes.values())))
+    late = max(changes, key=lambda name: abs(changes[name] - usual))
+    return max(changes.values()) - min(changes.values()), late
 
 
 def _ms(seconds: float) -> str:

@@ -47,6 +47,9 @@ class Timing:
     """When each was recorded, by the clock of the recorder [s]; stamps that are not finite are taken from here."""
 
 
+IN_SECONDS = Timing()
+
+
 def decide_unit(
     stamps: Float64[np.ndarray, "N"], timing: Timing, *, fps: float | None, stated: Unit | None
 ) -> Unit | Literal["frames"]:
@@ -109,7 +112,7 @@ def _by_step(step: float, timing: Timing, fps: float | None) -> Unit | Literal["
     found = f"{timing.source} step by {step:g}{'' if fps is None else f' where fps is {fps:g}'}"
     if not units:
         raise UnclearStamps(f"{found}: no plausible time in {_or(SECONDS)}, and no numbers of frames; {_write(fps)}")
-    raise UnclearStamps(f"{found} and may be {_or(units)}; {_write(fps)}")
+    raise UnclearStamps(f"when the pictures were taken is not known: {found} and may be {_or(units)}; {_write(fps)}")
 
 
 def _check_step(step: float, unit: str, timing: Timing, bounds: tuple[float, float]) -> None:
@@ -172,5 +175,5 @@ def _or(units: Iterable[str]) -> str:
 
 def _write(fps: float | None) -> str:
     """What to write where it is not clear."""
-    more = "" if fps is not None else ", or 'fps: 30' where they number frames"
-    return f"write their unit, 'time_unit: ms' (s, ms, us or ns){more}, or give the times in a file of their own"
+    frames = "" if fps is not None else "'fps: 30' where they number frames, or "
+    return f"write {frames}'time_unit: ms' for their unit (s, ms, us or ns), or give 'times', a file with them"
