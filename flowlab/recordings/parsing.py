@@ -15,6 +15,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
 from flowlab.recordings.checking import check_recording
 from flowlab.recordings.clock import put_on_one_clock
+from flowlab.recordings.content import without_saturated
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
@@ -75,7 +76,7 @@ class ParsedRecording:
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """What was looked at, and what came of it; what is refused is among them."""
-        return (*self.streams.checks, *check_recording(self))
+        return (*self.streams.checks, *self.frame_check.checks, *check_recording(self))
 
     @property
     def write_to(self) -> str:
@@ -138,7 +139,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
     metadata, origin = combine([*given, *streams.known])
     try:
-        streams = put_on_one_clock(_with_files(path, streams, metadata), metadata)
+        streams = without_saturated(put_on_one_clock(_with_files(path, streams, metadata), metadata))
     except UnclearStamps as error:
         raise DataError(f"{path}: clock: {error}; all this goes into {_write_to(path)}") from error
     seen = check_frames(
