@@ -20,6 +20,8 @@ _FAR = 3.0
 _FAR_SHARE = 0.02
 _RUN = 3
 """So many equal pictures in a row are no accident."""
+_MANY = 0.1
+"""Share of pictures that may equal the one before, as cameras give one twice now and then."""
 _JUMP = 2.5
 """A camera that stood still is told by this many times the usual change after it."""
 _MOVED = 0.05
@@ -140,7 +142,8 @@ def find_repeats(
         says += f"; {len(named)} pictures equal the one before: {', '.join(named[:3])}"
     if still:
         says += f"; {still} equal the one before while nothing else moved, as in a scene that stands still"
-    verdict = Verdict.DOUBTFUL if bad or named else Verdict.ASSUMED if still else Verdict.OK
+    many = bool(bad) or len(named) > _MANY * len(rows)
+    verdict = Verdict.DOUBTFUL if many else Verdict.ASSUMED if still or named else Verdict.OK
     return bad, Check("repeats", verdict, says)
 
 
