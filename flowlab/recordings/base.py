@@ -14,6 +14,7 @@ from flowlab.config import SettingsError
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.stamps import IN_SECONDS, Timing, UnclearStamps
 from flowlab.recordings.verdicts import Check
 from flowlab.registry import READERS, Plugin
 from flowlab.text import shown
@@ -27,14 +28,16 @@ class BadImage(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ImageStream:
-    """A stream of pictures, not yet decoded, in the order of time."""
+    """A stream of pictures, not yet decoded, in the order in which the recording has them."""
 
     names: tuple[str, ...]
     """What errors call each: its file, say."""
     time_s: Float64[np.ndarray, "N"]
-    """When each was taken, on the clock of the recording [s]."""
+    """When each was taken, on the clock of the recording [s]; from a reader in the unit that ``timing`` says."""
     read: Callable[[int], np.ndarray]
     """Decodes one: uint8 (H, W, 3) RGB, or depth counts (H, W). Raises :class:`BadImage`."""
+    timing: Timing = IN_SECONDS
+    """What is known of the times."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -42,12 +45,14 @@ class ImageStream:
 
 @dataclass(frozen=True, slots=True)
 class SampleStream:
-    """A stream of numbers, such as the robot's state, in the order of time."""
+    """A stream of numbers, such as the robot's state, in the order in which the recording has them."""
 
     name: str
     time_s: Float64[np.ndarray, "N"]
-    """On the clock of the pictures [s]."""
+    """On the clock of the pictures [s]; from a reader in the unit that ``timing`` says."""
     values: Float32[np.ndarray, "N D"]
+    timing: Timing = IN_SECONDS
+    """What is known of the times."""
     columns: tuple[str, ...] = field(default=(), kw_only=True)
     """What each number is called; empty where that is not known."""
 
@@ -120,6 +125,8 @@ def read_streams(reader: Reader, path: Path, given: Metadata) -> Streams:
         streams = reader.read(path, given)
     except SettingsError as error:  # of calibration that the recording itself holds
         raise DataError(f"{path}: {error}") from error
+    except UnclearStamps as error:
+        raise DataError(f"{path}: clock: {error}") from error
     except FlowlabError:
         raise
     except Exception as error:  # damaged files lead libraries, and readers of others, to raise anything
@@ -141,8 +148,13 @@ def _check_stream(stream: ImageStream | SampleStream, who: str) -> None:
     if not isinstance(time_s, np.ndarray) or time_s.shape != (count,) or time_s.dtype.kind != "f":
         found = f"{time_s.dtype}{time_s.shape}" if isinstance(time_s, np.ndarray) else shown(time_s)
         raise DataError(f"{who} gives {found} as the times of {name}, expected {count} seconds")
-    if not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
-        raise DataError(f"{who} gives times of {name} that fall or are not finite, expected seconds that rise")
+    timing = stream.timing
+    if not np.isfinite(time_s).all() and timing.recorded_s is None:
+        raise DataError(f"{who} gives times of {name} that are not finite")
+    if timing.recorded_s is not None and (
+        timing.recorded_s.shape != (count,) or not np.isfinite(timing.recorded_s).all()
+    ):
+        raise DataError(f"{who} gives other than {count} finite times of recording of {name}")
     if isinstance(stream, SampleStream) and (stream.values.ndim != 2 or not np.isfinite(stream.values).all()):
         raise DataError(f"{who} gives rows of {name} that are no finite numbers (rows, numbers)")
 

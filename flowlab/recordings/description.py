@@ -71,6 +71,7 @@ def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
     source = parse_recording(Path(path), settings)
     seen, streams, problem, frame_size = source.frame_check, source.streams, None, None
     try:
+        raise_refused(path, source.streams.checks)  # why frames are bad, where their clock is
         camera = source.frame_processor(settings).camera
         frame_size = camera.width, camera.height
         source.check_bad_frames(settings)

@@ -8,8 +8,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
+from flowlab.recordings.content import PictureDigest, digest, find_repeats
 from flowlab.recordings.frame_processing import Size
-from flowlab.recordings.sync import nearest_sample
+from flowlab.recordings.sync import nearest_sample, sampling_rate
+from flowlab.recordings.verdicts import Check
+
+_NEAR = 0.55
+"""So many intervals away a sample may be that is the nearest of a stream without a loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +43,8 @@ class FrameCheck:
     """Median depth reading of the first good row, in counts."""
     sync_s: Mapping[str, Float64[np.ndarray, "F"]] = field(default_factory=dict)
     """How far from each color frame its depth and its state are, bad ones included."""
+    checks: tuple[Check, ...] = ()
+    """What was looked at in the pictures, and what came of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +55,8 @@ class _ImageCheck:
     reason: str = ""
     """Why it is bad; empty where it is good."""
     median: float = 0.0
+    digest: PictureDigest | None = None
+    """Where it could be decoded."""
 
 
 def check_frames(
@@ -56,11 +65,13 @@ def check_frames(
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
-    depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``; and
-    where its time does not lie after the frame before.
+    depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
+    an interval; and where its time does not lie after the frame before.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
+    max_sync_s = min(max_sync_s, _half(streams.color))
+    max_state = {s.name: min(max_state_s, max(_half(streams.color), _half(s))) for s in streams.state}
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
@@ -76,16 +87,28 @@ def check_frames(
         if fault is None and off[k] > max_sync_s:
             fault = BadFrame(name, f"no depth within {_ms(max_sync_s)}: the nearest is {_ms(off[k])} away")
         if fault is None:
-            fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state_s)
+            fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state)
         if fault is not None:
             bad.append(fault)
             continue
         good.append((i, j))
         last = clock[k]
     rows = np.array(good, np.int64).reshape(-1, 2)
-    median = depth[good[0][1]].median if good else 0.0
+    frozen, repeats = _find_frozen(streams, color, depth, rows)
+    bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
+    rows = np.delete(rows, list(frozen), axis=0)
+    median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
-    return FrameCheck(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync)
+    return FrameCheck(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, (repeats,))
+
+
+def _find_frozen(
+    streams: Streams, color: Mapping[int, _ImageCheck], depth: Mapping[int, _ImageCheck], rows: Int64[np.ndarray, "T 2"]
+) -> tuple[dict[int, str], Check]:
+    """Good rows whose picture only came again, and the check of that."""
+    digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
+    state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
+    return find_repeats(streams, digests[0], digests[1], rows, state)
 
 
 def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | None) -> Int64[np.ndarray, "F"]:
@@ -106,7 +129,7 @@ def _look_at_color(picture: np.ndarray) -> _ImageCheck:
     """Color is judged by its size."""
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         return _ImageCheck((0, 0), f"is {picture.dtype} {picture.shape}, color is uint8 (height, width, 3)")
-    return _ImageCheck((picture.shape[1], picture.shape[0]))
+    return _ImageCheck((picture.shape[1], picture.shape[0]), digest=digest(picture))
 
 
 def _look_at_depth(counts: np.ndarray) -> _ImageCheck:
@@ -118,7 +141,8 @@ def _look_at_depth(counts: np.ndarray) -> _ImageCheck:
     size = counts.shape[1], counts.shape[0]
     if not readings.size:
         return _ImageCheck(size, "has no depth reading at all")
-    return _ImageCheck(size, median=float(np.median(readings[:: max(1, readings.size // 4096)])))
+    median = float(np.median(readings[:: max(1, readings.size // 4096)]))
+    return _ImageCheck(size, median=median, digest=digest(counts))
 
 
 def _usual_size(needs_frame: Iterable[_ImageCheck]) -> Size:
@@ -136,12 +160,18 @@ def _fault(name: str, look: _ImageCheck, usual: Size) -> BadFrame | None:
     return None
 
 
-def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: float) -> BadFrame | None:
+def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: Mapping[str, float]) -> BadFrame | None:
     """What is wrong where no sample of robot state is near enough; None if one is."""
     for stream, off in off_state.items():
-        if off[k] > max_state_s:
-            return BadFrame(name, f"no {stream} within {_ms(max_state_s)}: the nearest is {_ms(off[k])} away")
+        if off[k] > max_state_s[stream]:
+            return BadFrame(name, f"no {stream} within {_ms(max_state_s[stream])}: the nearest is {_ms(off[k])} away")
     return None
+
+
+def _half(stream: ImageStream | SampleStream) -> float:
+    """Half an interval of a stream, and as much more as intervals vary [s]; farther away is another frame's."""
+    rate = sampling_rate(stream.time_s)
+    return _NEAR / rate if 0 < rate < np.inf else np.inf
 
 
 def _ms(seconds: float) -> str:

@@ -14,6 +14,7 @@ from flowlab.array_files import load_array, load_arrays
 from flowlab.errors import DataError
 from flowlab.limits import MAX_PICTURE_BYTES, MAX_PIXELS, MAX_SCANS
 from flowlab.recordings.base import BadImage, ImageStream
+from flowlab.recordings.stamps import IN_SECONDS, Timing
 from flowlab.text import cut, natural_key
 from flowlab.untrusted import read_bytes
 
@@ -38,16 +39,16 @@ def list_images(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(found, key=lambda f: natural_key(f.name))
 
 
-def color_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"]) -> ImageStream:
+def color_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"], timing: Timing = IN_SECONDS) -> ImageStream:
     """Color pictures of files."""
     files = tuple(files)
-    return ImageStream(tuple(_name(f) for f in files), time_s, partial(_read, files, decode_color))
+    return ImageStream(tuple(_name(f) for f in files), time_s, partial(_read, files, decode_color), timing)
 
 
-def depth_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"]) -> ImageStream:
+def depth_stream(files: Sequence[Path], time_s: Float64[np.ndarray, "N"], timing: Timing = IN_SECONDS) -> ImageStream:
     """Depth pictures of files."""
     files = tuple(files)
-    return ImageStream(tuple(_name(f) for f in files), time_s, partial(_read, files, decode_depth))
+    return ImageStream(tuple(_name(f) for f in files), time_s, partial(_read, files, decode_depth), timing)
 
 
 def _name(file: Path) -> str:

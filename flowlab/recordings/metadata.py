@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Num
@@ -10,6 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 
 from flowlab.config import Settings, SettingsError
 from flowlab.errors import DataError, unknown_name
+from flowlab.recordings.stamps import Unit
 from flowlab.text import cut, is_path_inside, shown
 from flowlab.untrusted import read_yaml
 
@@ -122,11 +123,19 @@ class Metadata(_FiniteSettings):
     depth: PathInside = "depth"
     """Folder of the depth pictures."""
     fps: float | None = Field(default=None, gt=0)
-    """Pictures per second, where there is no file of times."""
+    """Pictures per second, where their names number frames; where there are times, these must agree."""
     times: PathInside | None = None
     """File with the time of every color picture [s], one a line; of the depth pictures too without ``depth_times``."""
     depth_times: PathInside | None = None
     """File with the time of every depth picture [s]."""
+    time_unit: Unit | None = None
+    """Unit of times in names, lists and files, where it is not clear: s, ms, us or ns."""
+    clock: Literal["stamps", "recorded"] | None = None
+    """Which times of messages to take, where their stamps and the times of recording do not agree."""
+    depth_offset_s: float | None = None
+    """Added to the times of depth [s]; 0 says that equal frame numbers belong together."""
+    state_offset_s: float | None = None
+    """Added to the times of state and actions [s], where their clock is behind that of the pictures."""
     intrinsics: Intrinsics | None = None
     """The color camera."""
     depth_unit_m: float | None = Field(default=None, gt=0)

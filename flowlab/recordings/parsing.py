@@ -14,10 +14,13 @@ from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
 from flowlab.recordings.checking import check_recording
+from flowlab.recordings.clock import put_on_one_clock
+from flowlab.recordings.content import without_saturated
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
 from flowlab.recordings.sample_files import load_samples
+from flowlab.recordings.stamps import UnclearStamps
 from flowlab.recordings.sync import last_sample, nearest_sample
 from flowlab.recordings.verdicts import Check
 
@@ -73,13 +76,12 @@ class ParsedRecording:
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """What was looked at, and what came of it; what is refused is among them."""
-        return (*self.streams.checks, *check_recording(self))
+        return (*self.streams.checks, *self.frame_check.checks, *check_recording(self))
 
     @property
     def write_to(self) -> str:
         """What errors tell the user to write into."""
-        file = self.path / FILE_NAME if self.path.is_dir() else self.path.with_suffix(".yaml")
-        return f"{file} (or the calibration file)"
+        return _write_to(self.path)
 
     def frame_processor(self, settings: RecordingSettings) -> FrameProcessor:
         """What makes frames of it. Raises :class:`DataError` where calibration is missing or cannot be."""
@@ -122,6 +124,11 @@ class ParsedRecording:
         return AlignedSamples(clock, state, action, how)
 
 
+def _write_to(path: Path) -> str:
+    """What errors tell the user to write into."""
+    return f"{path / FILE_NAME if path.is_dir() else path.with_suffix('.yaml')} (or the calibration file)"
+
+
 def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     """Read the streams, find out what is known of them, and look at every picture."""
     reader = choose_reader(path, settings.reader)
@@ -131,7 +138,10 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         if not len(stream):
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
     metadata, origin = combine([*given, *streams.known])
-    streams = _with_files(path, streams, metadata)
+    try:
+        streams = without_saturated(put_on_one_clock(_with_files(path, streams, metadata), metadata))
+    except UnclearStamps as error:
+        raise DataError(f"{path}: clock: {error}; all this goes into {_write_to(path)}") from error
     seen = check_frames(
         streams,
         every=settings.every,
@@ -171,6 +181,6 @@ def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
         if file is not None:
             where = None if times is None else folder / times
             columns = getattr(metadata, f"{name}_columns")
-            samples = load_samples(folder / file, name, where, streams.color.time_s, FILE_NAME, columns)
+            samples = load_samples(folder / file, name, where, streams.color, FILE_NAME, columns)
             changed[name] = (samples,)
     return replace(streams, **changed)

@@ -112,6 +112,7 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     :class:`DataError` with one sentence where it cannot be opened.
     """
     source = parse_recording(Path(path), settings)
+    raise_refused(path, source.streams.checks)
     processor = source.frame_processor(settings)
     source.check_bad_frames(settings)
     raise_refused(path, source.checks)

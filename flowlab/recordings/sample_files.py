@@ -7,48 +7,47 @@ import numpy as np
 from jaxtyping import Float32, Float64, Num
 
 from flowlab.errors import DataError
-from flowlab.recordings.base import SampleStream
+from flowlab.recordings.base import ImageStream, SampleStream
+from flowlab.recordings.stamps import Timing, Unit
 from flowlab.recordings.tables import base_and_unit, find_columns, read_table
 
 
-def load_times(path: Path) -> Float64[np.ndarray, "N"]:
-    """Times [s] of a file, one a line or as a numpy array; they must rise."""
+def load_times(path: Path) -> tuple[Float64[np.ndarray, "N"], Timing]:
+    """Times of a file, one a line or as a numpy array, as they stand there or in seconds, and what is known of them."""
     table = read_table(path)
     if table.values.shape[1] != 1 or table.text:
-        raise DataError(f"{path}: has {table.values.shape[1]} numbers a line, expected one time in seconds")
-    unit = base_and_unit(table.names[0])[1] if table.names else None
-    return check_times(path, table.values[:, 0] * (unit or 1.0))
+        raise DataError(f"{path}: has {table.values.shape[1]} numbers a line, expected one time")
+    scale = base_and_unit(table.names[0])[1] if table.names else None
+    return check_times(path, table.values[:, 0] * (scale or 1.0), None if scale is None else "s", integers=table.whole)
 
 
-def check_times(path: Path, time_s: Num[np.ndarray, "N"]) -> Float64[np.ndarray, "N"]:
-    """The same times, where they can be seconds and never fall."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        step = np.diff(time_s)
-    if not np.isfinite(time_s).all() or (step < 0).any():
-        at = int(np.argmax(~(np.append(0, step) >= 0)))
-        raise DataError(f"{path}: the times must rise, and entry {at + 1} ({time_s[at]}) does not")
-    if len(step) and np.median(step) > 10:
-        raise DataError(
-            f"{path}: the times must be in seconds; with a median of {np.median(step):g} between two they look like "
-            "milli-, micro- or nanoseconds"
-        )
-    return time_s.astype(np.float64)
+def check_times(
+    path: Path, time: Num[np.ndarray, "N"], unit: Unit | None = None, *, integers: bool = False
+) -> tuple[Float64[np.ndarray, "N"], Timing]:
+    """The same times, where they are finite; in which unit they are is decided elsewhere, where it is not stated."""
+    if not np.isfinite(time).all():
+        at = int(np.argmin(np.isfinite(time)))
+        raise DataError(f"{path}: entry {at + 1} ({time[at]}) is no time")
+    return time.astype(np.float64), Timing(path.name, unit=unit, integers=unit is None and integers)
 
 
 def load_samples(
     path: Path,
     name: str,
     times: Path | None,
-    color_time_s: Float64[np.ndarray, "F"],
+    color: ImageStream,
     write_to: str,
     columns: Sequence[str] | None = None,
 ) -> SampleStream:
     """Rows of numbers: with times of their own (a file, or a column of times), else one per color picture."""
-    found = find_columns(read_table(path), name, columns, color_time_s, times is not None)
-    own = None if found.time is None else check_times(path, found.time)
+    table = read_table(path)
+    clock = color.time_s if color.timing.unit is not None else color.time_s[:0]  # numbers of frames are no clock
+    found = find_columns(table, name, columns, clock, times is not None)
+    unit: Unit | None = "s" if found.unit_known else None
+    own = None if found.time is None else check_times(path, found.time, unit, integers=table.whole)
     if times is not None:
         own = load_times(times)
-    where = color_time_s if own is None else own
+    where, timing = (color.time_s, color.timing) if own is None else own
     if len(where) != len(found.values):
         of = "times" if own is not None else "color pictures"
         raise DataError(
@@ -59,7 +58,7 @@ def load_samples(
     if not np.isfinite(rows).all():
         row = int(np.argmax(~np.isfinite(rows).all(1)))
         raise DataError(f"{path}: row {row + 1} holds a value that is not finite, or too large for float32")
-    return SampleStream(name, where, rows, columns=found.names)
+    return SampleStream(name, where, rows, timing, columns=found.names)
 
 
 def to_float32(values: Num[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:

@@ -223,14 +223,17 @@ def test_what_does_not_fit_is_named(tmp_path: Path, keys: dict[str, Any], messag
         opened(path, reader="plain")
 
 
-def test_names_without_numbers_are_paired_by_order(tmp_path: Path) -> None:
+def test_names_without_numbers_are_never_paired_by_order(tmp_path: Path) -> None:
     path = write_folder(tmp_path / "r", steps=3)
     for folder in ("color", "depth"):
         for name, file in zip("abc", sorted((path / folder).iterdir()), strict=True):
             file.rename(file.with_name(f"{name}.png"))
-    assert_frames(opened(path), [0, 1, 2])
-    (path / "depth" / "b.png").unlink()
-    with pytest.raises(DataError, match="3 color and 2 depth pictures cannot be paired"):
+    with pytest.raises(DataError, match=r"names in color/ have no number to tell time by, as 'a\.png'; write 'times: "):
+        opened(path)
+    (path / "t.txt").write_text("0.0\n0.1\n0.2\n")
+    assert_frames(opened(write_folder(path, steps=0, times="t.txt", fps=None)), [0, 1, 2])
+    (path / "depth" / "b.png").rename(path / "depth" / "d.png")
+    with pytest.raises(DataError, match="the depth pictures are not named as those are"):
         opened(path)
 
 

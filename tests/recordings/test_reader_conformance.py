@@ -155,7 +155,7 @@ def color(change: Callable[[ImageStream], ImageStream]) -> dict[str, Any]:
 
 
 def decode(change: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
-    return color(lambda images: ImageStream(images.names, images.time_s, lambda k: change(images.read(k))))
+    return color(lambda images: replace(images, read=lambda k: change(images.read(k))))
 
 
 def unwary(images: ImageStream, path: Path) -> ImageStream:
@@ -239,8 +239,8 @@ def greedy(self: object, path: Path) -> bool:
         ({"probe": greedy}, "must not recognize 'empty', which is something else"),
         ({"probe": lambda self, path: path.suffix == ".box" or path.read_text() == ""}, "raises IsADirectoryError"),
         ({"probe": lambda self, path: path.suffix == ".box"}, "must not recognize what is not there"),
-        (color(counted_in_ms), "the color stream must have times in seconds, but half of them are 100000 apart"),
-        (color(lambda i: replace(i, time_s=i.time_s[::-1])), "the color stream must be in the order of time"),
+        (color(counted_in_ms), "times must be clear, .* step by 1e.06 where fps is 10: no plausible"),
+        (color(lambda i: replace(i, time_s=i.time_s[::-1])), "times must be clear, .* the stamps of color must rise"),
         (color(lambda i: replace(i, time_s=i.time_s.astype(np.float32))), r"must have times of float64 \[s\]"),
         (color(lambda i: replace(i, names=i.names[1:])), "the color stream must have a time for each of 5"),
         (decode(lambda p: p.astype(float)), "color pictures must be uint8, but are float64"),

@@ -61,7 +61,7 @@ def test_associations_do_without_lists(tmp_path: Path) -> None:
     path = write_sequence(tmp_path / "seq", lists=False)
     pairs = list(zip(COLOR_S[[0, 1, 2, 4, 5]], DEPTH_S, strict=True))
     lines = [f"{c:.6f} rgb/{c:.6f}.png {d:.6f} depth/{d:.6f}.png" for c, d in pairs]
-    (path / "associations.txt").write_text("\n".join(reversed(lines)))
+    (path / "associations.txt").write_text("\n".join(lines))
     write_yaml(path / "recording.yaml", intrinsics=INTRINSICS, depth_unit_m=0.001)
     for k, t in enumerate([0, 1, 2, 4, 5]):
         recording = opened(path)

@@ -1,7 +1,7 @@
 """One episode as arrays, as diffusion policies keep them: an ``.npz`` file, or a folder of ``.npy`` files."""
 
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
 from flowlab.recordings.sample_files import check_times, to_float32
+from flowlab.recordings.stamps import Timing
 from flowlab.text import cut
 
 NAMES = {
@@ -87,7 +88,7 @@ class ArraysReader:
         assert color is not None
         assert depth is not None
         _check(store, names, color, depth)
-        time_s = _times(store, len(color), given)
+        stamps = _times(store, len(color), given)
         K = store.load("intrinsics")
         T = None if given.T_world_cam is not None else store.load("pose")
         known: tuple[tuple[str, Metadata], ...] = (
@@ -95,10 +96,10 @@ class ArraysReader:
         )
         known += () if T is None else ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
-            ImageStream(_called(names["color"], len(color)), time_s, partial(_color, store, color)),
-            ImageStream(_called(names["depth"], len(depth)), time_s, partial(_depth, store, depth)),
-            state=_samples(store, "state", time_s),
-            action=_samples(store, "action", time_s),
+            ImageStream(_called(names["color"], len(color)), stamps[0], partial(_color, store, color), stamps[1]),
+            ImageStream(_called(names["depth"], len(depth)), stamps[0], partial(_depth, store, depth), stamps[1]),
+            state=_samples(store, "state", *stamps),
+            action=_samples(store, "action", *stamps),
             known=known,
         )
 
@@ -153,21 +154,22 @@ def _depth(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
     return check_depth(np.array(pictures[index]))
 
 
-def _times(store: _Store, steps: int, given: Metadata) -> np.ndarray:
-    """When every step was [s]."""
+def _times(store: _Store, steps: int, given: Metadata) -> tuple[np.ndarray, Timing]:
+    """When every step was, and what is known of that."""
     time_s = store.load("time")
     if time_s is not None:
         if time_s.shape != (steps,) or time_s.dtype.kind not in "iuf":
             found = f"{time_s.dtype} {cut(str(time_s.shape))}"
             raise DataError(f"{store.path}: '{store.names['time']}' is {found}, expected numbers ({steps},)")
-        return check_times(store.path, np.asarray(time_s, np.float64))
+        stamps, timing = check_times(store.path, np.asarray(time_s), integers=time_s.dtype.kind in "iu")
+        return stamps, replace(timing, source=f"'{store.names['time']}'")
     if given.fps is None:
         where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name
         raise DataError(f"{store.path}: has no times; write 'fps: 10' (steps per second) into {where}")
-    return np.arange(steps) / given.fps
+    return np.arange(steps) / given.fps, Timing("steps over fps")
 
 
-def _samples(store: _Store, what: str, time_s: np.ndarray) -> tuple[SampleStream, ...]:
+def _samples(store: _Store, what: str, time_s: np.ndarray, timing: Timing) -> tuple[SampleStream, ...]:
     """The rows of state or actions; nothing where there is no such array."""
     values = store.load(what)
     if values is None:
@@ -180,7 +182,7 @@ def _samples(store: _Store, what: str, time_s: np.ndarray) -> tuple[SampleStream
     rows = to_float32(values)
     if not np.isfinite(rows).all():
         raise DataError(f"{store.path}: '{store.names[what]}' holds values that are not finite")
-    return (SampleStream(what, time_s, rows),)
+    return (SampleStream(what, time_s, rows, timing),)
 
 
 def _known(path: Path, K: np.ndarray) -> Metadata:

@@ -8,9 +8,11 @@ from jaxtyping import Float64
 
 from flowlab.errors import DataError, first_line
 from flowlab.recordings.base import Streams
+from flowlab.recordings.file_stamps import read_names
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, load_metadata
 from flowlab.recordings.sample_files import load_times
+from flowlab.recordings.stamps import Timing
 from flowlab.recordings.writing import write_rgbd_recording
 from flowlab.untrusted import read_json
 
@@ -46,16 +48,15 @@ def read_folder(path: Path, given: Metadata, fps: float | None, known: tuple[tup
     color = _list(path, "color", given.color, COLOR_SUFFIXES)
     depth = _list(path, "depth", given.depth, DEPTH_SUFFIXES)
     if given.times is not None:
-        color_s = _timed(path / given.times, color)
-        depth_s = _timed(path / (given.depth_times or given.times), depth)
-    elif fps is not None:
-        color_s, depth_s = _numbered(path, color, depth, fps)
-    else:
-        raise DataError(
-            f"{path}: when the pictures were taken is not known; write into {path / FILE_NAME} 'fps: 30', or "
-            "'times: times.txt' for a file with the time of every color picture in seconds, one a line"
-        )
-    return Streams(color_stream(color, color_s), depth_stream(depth, depth_s), known=known)
+        color_stamps = _listed(path / given.times, color)
+        own = given.depth_times is not None
+        depth_stamps = _listed(path / given.depth_times, depth) if own else _shared(path, given, color, depth)  # type: ignore[operator]
+        return Streams(color_stream(color, *color_stamps), depth_stream(depth, *depth_stamps), known=known)
+    return Streams(
+        color_stream(*read_names(color, f"the names in {given.color}/")),
+        depth_stream(*read_names(depth, f"the names in {given.depth}/")),
+        known=known,
+    )
 
 
 def open3d_calibration(path: Path) -> tuple[tuple[str, Metadata], ...]:
@@ -91,36 +92,26 @@ def _list(path: Path, what: str, folder: str, suffixes: tuple[str, ...]) -> list
     return found
 
 
-def _timed(file: Path, pictures: list[Path]) -> Float64[np.ndarray, "N"]:
+def _listed(file: Path, pictures: list[Path]) -> tuple[Float64[np.ndarray, "N"], Timing]:
     """The times of pictures from a file."""
-    time_s = load_times(file)
-    if len(time_s) != len(pictures):
+    stamps, timing = load_times(file)
+    if len(stamps) != len(pictures):
         raise DataError(
-            f"{file}: has {len(time_s)} times for {len(pictures)} pictures in {pictures[0].parent.name}/; "
+            f"{file}: has {len(stamps)} times for {len(pictures)} pictures in {pictures[0].parent.name}/; "
             "give one a picture, and depth its own file with 'depth_times' where its pictures are others"
         )
-    return time_s
+    return stamps, timing
 
 
-def _numbered(path: Path, color: list[Path], depth: list[Path], fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times of pictures by the number in their names, so that a missing one is a gap; else by their order."""
-    numbers = [_numbers(files) for files in (color, depth)]
-    if numbers[0] is not None and numbers[1] is not None:
-        return (numbers[0] - numbers[0][0]) / fps, (numbers[1] - numbers[0][0]) / fps
-    if len(color) != len(depth):
+def _shared(
+    path: Path, given: Metadata, color: list[Path], depth: list[Path]
+) -> tuple[Float64[np.ndarray, "N"], Timing]:
+    """The times of color for depth, where every depth picture is named as a color picture is."""
+    names = [[re.sub(r"\D+", " ", f.stem).split() or [f.stem] for f in files] for files in (color, depth)]
+    if names[0] != names[1] and [f.stem for f in color] != [f.stem for f in depth]:
         raise DataError(
-            f"{path}: {len(color)} color and {len(depth)} depth pictures cannot be paired, for their names do not "
-            "count frames; number them, or give 'times' and 'depth_times'"
+            f"{path / str(given.times)}: has the times of the color pictures, and the depth pictures are not named as "
+            f"those are ({color[0].name} to {color[-1].name}, {depth[0].name} to {depth[-1].name}); give depth its own "
+            "file with 'depth_times'"
         )
-    order = np.arange(len(color)) / fps
-    return order, order
-
-
-def _numbers(files: list[Path]) -> np.ndarray | None:
-    """The last number of each name, where these count frames: rising, and not more than half missing."""
-    found = [re.findall(r"\d+", f.stem) for f in files]
-    if not all(found) or any(len(f[-1]) > 9 for f in found):
-        return None
-    numbers = np.array([int(f[-1]) for f in found], np.float64)
-    counts = (np.diff(numbers) > 0).all() and numbers[-1] - numbers[0] < 2 * len(files)
-    return numbers if counts else None
+    return _listed(path / str(given.times), depth)

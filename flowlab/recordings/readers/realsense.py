@@ -45,7 +45,7 @@ class RealSenseReader:
         lost = _lost(folder, len(streams.color), fps)
         return Streams(
             streams.color, streams.depth, known=known, registered=True,
-            checks=(Check("clock", Verdict.ASSUMED, "times are frame numbers over the frame rate"), *lost),
+            checks=(Check("frame rate", Verdict.ASSUMED, "times are frame numbers over the frame rate"), *lost),
         )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from flowlab.recordings.image_files import COLOR_SUFFIXES, color_stream, depth_s
 from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, check_rigid
 from flowlab.recordings.readers.safe_pickle import pickled_numbers
 from flowlab.recordings.sample_files import to_float32
+from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut, is_plain_name, shown
 from flowlab.untrusted import read_json, read_text
@@ -46,15 +47,15 @@ class RH20TReader:
         folder = path if _has_pictures(path) else _choose(path, given.camera)
         episode, serial = folder.parent, folder.name.removeprefix("cam_")
         about = _about(episode / "metadata.json")
-        stop_s = float(about["finish_time"]) / 1000 if "finish_time" in about else np.inf
-        color, color_s = _timed(folder / "color", COLOR_SUFFIXES, stop_s)
-        depth, depth_s = _timed(folder / "depth", (".png",))
+        stop_ms = float(about.get("finish_time", np.inf))
+        color = _timed(folder / "color", COLOR_SUFFIXES, stop_ms)
+        depth = _timed(folder / "depth", (".png",))
         calibration, checks = _calibration(episode, serial, about)
         success = {"success": float(about["rating"]) > 1} if "rating" in about else {}
         known = Metadata(depth_unit_m=0.00025 if "f" in serial else 0.001, **success)
         return Streams(
-            color_stream(color, color_s),
-            depth_stream(depth, depth_s),
+            color_stream(*color),
+            depth_stream(*depth),
             state=_state([folder, episode]),
             known=(*calibration, ("the custom of RH20T", known)),
             registered=True,
@@ -103,16 +104,17 @@ def _about(file: Path) -> dict[str, Any]:
     return found
 
 
-def _timed(folder: Path, suffixes: Sequence[str], stop_s: float = np.inf) -> tuple[list[Path], np.ndarray]:
-    """Files whose names are milliseconds, and these in seconds."""
+def _timed(folder: Path, suffixes: Sequence[str], stop_ms: float = np.inf) -> tuple[list[Path], np.ndarray, Timing]:
+    """Files whose names are milliseconds by the custom of the layout, and these."""
     files = list_images(folder, suffixes)
     strangers = [f.name for f in files if not (f.stem.isascii() and f.stem.isdecimal() and len(f.stem) < 16)]
     if strangers:
         raise DataError(
             f"{folder}: {shown(strangers[0])} is not named by its time in milliseconds, as RH20T's files are"
         )
-    kept = [f for f in files if int(f.stem) / 1000 <= stop_s]
-    return kept, np.array([int(f.stem) / 1000 for f in kept])
+    kept = [f for f in files if int(f.stem) <= stop_ms]
+    timing = Timing(f"the names in {folder.name}/", unit=None, custom="ms", integers=True, names=True)
+    return kept, np.array([float(f.stem) for f in kept]), timing
 
 
 def _state(folders: list[Path]) -> tuple[SampleStream, ...]:
@@ -120,9 +122,11 @@ def _state(folders: list[Path]) -> tuple[SampleStream, ...]:
     found = []
     for name in STATE:
         folder = next((f / name for f in folders if (f / name).is_dir()), None)
-        files, time_s = ([], np.empty(0)) if folder is None else _timed(folder, (".npy",))
+        if folder is None:
+            continue
+        files, stamps, timing = _timed(folder, (".npy",))
         if files:
-            found.append(SampleStream(name, time_s, _rows(files)))
+            found.append(SampleStream(name, stamps, _rows(files), timing))
     return tuple(found)
 
 

@@ -24,6 +24,7 @@ from flowlab.recordings.readers.ros_messages import (
     relative_pose,
 )
 from flowlab.recordings.sample_files import to_float32
+from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 
@@ -35,8 +36,6 @@ REGISTERED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_col
 """What the topics of depth that is seen from the color camera are called."""
 COMPRESSED = ("compressed", "compressedDepth")
 SDK_UNIT = "/option/Depth_Units/value"
-CLOCK_ERROR_S = 10.0
-"""Where stamps are farther than this from the times of recording, they are from another clock."""
 
 
 class ROSReader:
@@ -60,13 +59,9 @@ class ROSReader:
         bag = RosBag(path)
         topics = choose_topics(bag, given)
         indices = {topic: bag.index(topic) for topic in dict.fromkeys(topics.all())}
-        own_clock = not any(_is_off(i) for i in indices.values())
-        streams = {t: _Topic(bag, t, i, own_clock) for t, i in indices.items()}
+        streams = {t: _Topic(bag, t, i) for t, i in indices.items()}
         registered, known = _calibration(bag, topics)
         checks = [Check("topics", Verdict.OK, f"read are {', '.join(topics.all())}")]
-        if not own_clock:
-            says = "the messages' stamps are from another clock, so the times of recording are taken"
-            checks.append(Check("clock", Verdict.ASSUMED, says))
         robot: dict[str, tuple[SampleStream, ...]] = {}
         for what, topic in (("state", topics.state), ("action", topics.action)):
             robot[what], told = ((), []) if topic is None else streams[topic].samples(what)
@@ -195,12 +190,6 @@ def _unit(bag: RosBag, depth: str) -> tuple[str, Metadata]:
     return "the custom of ROS (REP 118)", Metadata(depth_unit_m=depth_unit_of(bag.first(depth)))
 
 
-def _is_off(index: BagIndex) -> bool:
-    """Whether the stamps of a topic are from another clock than the recording."""
-    off = np.abs(index.measured_s - index.recorded_ns * 1e-9)
-    return bool(np.isfinite(off).any() and np.nanmedian(off) > CLOCK_ERROR_S)
-
-
 def _unchosen(bag: RosBag, topics: ChosenTopics) -> list[Check]:
     """A doubt where several topics may be the state, and none of them is taken."""
     joints = list(bag.topics(JOINTS))
@@ -212,25 +201,21 @@ def _unchosen(bag: RosBag, topics: ChosenTopics) -> list[Check]:
 
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A topic in the order of time."""
+    """A topic in the order of recording."""
 
     bag: RosBag
     name: str
     index: BagIndex
-    own_clock: bool
-    """Whether the times are those that the messages say."""
 
-    def times(self) -> np.ndarray:
-        """When each message is from, in the order of recording [s]."""
-        recorded = self.index.recorded_ns * 1e-9
-        stamped = self.own_clock and np.isfinite(self.index.measured_s).all()
-        return self.index.measured_s if stamped else recorded
+    def timing(self, messages: np.ndarray | slice = slice(None)) -> Timing:
+        """What is known of the stamps of some messages, which ROS has in seconds."""
+        recorded_s = self.index.recorded_ns[messages] * 1e-9
+        return Timing(f"the stamps of {self.name}", overtaking=True, recorded_s=recorded_s)
 
     def pictures(self) -> ImageStream:
         """Its messages as pictures."""
-        order = np.argsort(self.times(), kind="stable")
-        names = tuple(f"{self.name}[{i}]" for i in order)
-        return ImageStream(names, self.times()[order], partial(_picture, self, order))
+        names = tuple(f"{self.name}[{i}]" for i in range(len(self.index.measured_s)))
+        return ImageStream(names, self.index.measured_s, partial(_picture, self), self.timing())
 
     def samples(self, what: str) -> tuple[tuple[SampleStream, ...], list[Check]]:
         """Its messages as rows of numbers, and what is to be said of them; joints by their names."""
@@ -243,10 +228,9 @@ class _Topic:
             groups, checks = [_unnamed(place, what, messages)], []
         streams = []
         for k, group in enumerate(groups):
-            time_s = self.times()[group.messages]
-            order = np.argsort(time_s, kind="stable")
             name = what if k == 0 else f"{what} {k + 1}"
-            streams.append(SampleStream(name, time_s[order], group.positions[order], columns=group.names))
+            stamps, timing = self.index.measured_s[group.messages], self.timing(group.messages)
+            streams.append(SampleStream(name, stamps, group.positions, timing, columns=group.names))
         return tuple(streams), checks
 
 
@@ -279,6 +263,6 @@ def _check_unnamed(place: str, what: str, groups: Sequence[JointGroup]) -> None:
         )
 
 
-def _picture(topic: _Topic, order: np.ndarray, i: int) -> np.ndarray:
-    """Decode the i-th picture of a topic in the order of time."""
-    return decode_image(topic.bag.message(topic.name, topic.index, int(order[i])))
+def _picture(topic: _Topic, i: int) -> np.ndarray:
+    """Decode the i-th picture of a topic in the order of recording."""
+    return decode_image(topic.bag.message(topic.name, topic.index, i))

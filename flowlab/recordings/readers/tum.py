@@ -1,5 +1,6 @@
 """The layout of the TUM RGB-D benchmark: ``rgb.txt`` and ``depth.txt`` list pictures with their times."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.metadata import Intrinsics, Metadata
+from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import is_path_inside, shown
 from flowlab.untrusted import read_text
@@ -43,25 +45,25 @@ class TUMReader:
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams; both lists where there are, else the pairs of the associations."""
         if _both(path):
-            color, depth = _entries(path / "rgb.txt", 2), _entries(path / "depth.txt", 2)
+            lists = ["rgb.txt", "depth.txt"]
+            color, depth = (_entries(path / name, 2) for name in lists)
         else:
             file = _associations(path)
             if file is None:
                 raise DataError(f"{path}: has neither rgb.txt and depth.txt nor {ASSOCIATIONS[0]}")
-            pairs = _entries(file, 4)
+            pairs, lists = _entries(file, 4), [file.name, file.name]
             if pairs and "depth" in pairs[0][1].lower() and "depth" not in pairs[0][3].lower():  # as ICL-NUIM has it
-                pairs = sorted(((*p[2:], *p[:2]) for p in pairs), key=lambda p: float(p[0]))
-            color, depth = [p[:2] for p in pairs], sorted(((p[2], p[3]) for p in pairs), key=lambda p: float(p[0]))
+                pairs = [(*p[2:], *p[:2]) for p in pairs]
+            color, depth = [p[:2] for p in pairs], [p[2:] for p in pairs]
         known = [("the custom of TUM RGB-D", Metadata(depth_unit_m=1 / DEPTH_FACTOR))]
         camera = next((name for name in KINECTS if name in path.resolve().name), None)
         if camera is not None:
             known.append((f"TUM RGB-D's calibration of {camera}", Metadata(intrinsics=KINECTS[camera])))
         files = [[path / entry[1] for entry in entries] for entries in (color, depth)]
-        times = [np.array([float(entry[0]) for entry in entries]) for entries in (color, depth)]
         moving = Check("camera", Verdict.DOUBTFUL, "it moves (groundtruth.txt), and is taken as fixed")
         return Streams(
-            color_stream(files[0], times[0]),
-            depth_stream(files[1], times[1]),
+            color_stream(files[0], *_stamps(lists[0], color)),
+            depth_stream(files[1], *_stamps(lists[1], depth)),
             known=tuple(known),
             registered=True,
             checks=(moving,) if (path / "groundtruth.txt").is_file() else (),
@@ -79,7 +81,7 @@ def _associations(path: Path) -> Path | None:
 
 
 def _entries(file: Path, width: int) -> list[tuple[str, ...]]:
-    """Lines of a list, in the order of the time they begin with."""
+    """Lines of a list, in its order."""
     found = []
     for number, line in enumerate(read_text(file).splitlines(), 1):
         parts = tuple(line.split())
@@ -94,4 +96,12 @@ def _entries(file: Path, width: int) -> list[tuple[str, ...]]:
         if not all(is_path_inside(name) for name in parts[1::2]):
             raise DataError(f"{file}: line {number} names {shown(line)}, expected files in the recording's folder")
         found.append(parts)
-    return sorted(found, key=lambda p: float(p[0]))
+    if not found:
+        raise DataError(f"{file}: lists no picture")
+    return found
+
+
+def _stamps(name: str, entries: Sequence[tuple[str, ...]]) -> tuple[np.ndarray, Timing]:
+    """The stamps of a list, as they stand there."""
+    texts = [entry[0] for entry in entries]
+    return np.array(texts, np.float64), Timing(name, unit=None, integers=all(t.isdecimal() for t in texts))

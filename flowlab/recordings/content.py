@@ -1,0 +1,180 @@
+"""What pictures hold: depth that stands for no reading, and pictures that come again and again."""
+
+import zlib
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Int64, Num
+
+from flowlab.recordings.base import BadImage, ImageStream, Streams
+from flowlab.recordings.verdicts import Check, Verdict
+
+_SAMPLES = 5
+"""Depth pictures that are looked at for readings that are none."""
+_FAR = 3.0
+"""A greatest reading this many times the median of the others, and often, is that of a plane where nothing was."""
+_FAR_SHARE = 0.02
+_RUN = 3
+"""So many equal pictures in a row are no accident."""
+_MANY = 0.1
+"""Share of pictures that may equal the one before, as cameras give one twice now and then."""
+_JUMP = 2.5
+"""A camera that stood still is told by this many times the usual change after it."""
+_MOVED = 0.05
+"""A robot moved where a number of its state changed by this share of its range."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureDigest:
+    """What is kept of a picture that was looked at."""
+
+    checksum: int
+    """The same only for pictures that are the same bit by bit."""
+    small: Num[np.ndarray, "h w"]
+    """The picture, thinned, to tell how much has changed."""
+
+
+def digest(picture: np.ndarray) -> PictureDigest:
+    """What is kept of a picture."""
+    gray = picture[..., 1] if picture.ndim == 3 else picture
+    step = max(1, gray.shape[0] // 24), max(1, gray.shape[1] // 32)
+    small = np.nan_to_num(gray[:: step[0], :: step[1]].astype(np.float32), posinf=0, neginf=0)
+    return PictureDigest(zlib.crc32(np.ascontiguousarray(picture).tobytes()), small)
+
+
+# --- readings that are none -------------------------------------------------------------------------------
+
+
+def without_saturated(streams: Streams) -> Streams:
+    """The same streams, their depth without readings that stand for none, and with a check that says so."""
+    depth = streams.depth
+    found, shares = [], []
+    for i in np.unique(np.linspace(0, len(depth) - 1, _SAMPLES).astype(int)):
+        try:
+            counts = depth.read(int(i))
+        except BadImage:
+            continue
+        if counts.ndim == 2 and counts.dtype.kind in "iuf" and (value := _saturated(counts)) is not None:
+            found.append(value)
+            shares.append(float((counts == value).mean()))
+    value, times = Counter(found).most_common(1)[0] if found else (None, 0)
+    far = value if times >= _RUN or times == len(depth) else None
+    masked = replace(depth, read=partial(_read_masked, depth.read, far))
+    if value is None:
+        check = Check("saturated depth", Verdict.OK, "no reading is that of a limit")
+    elif far is None and value != _limit(np.dtype(np.uint16)):
+        return replace(streams, depth=masked)
+    else:
+        says = f"{value:g} counts are taken as no reading: the greatest, in {np.mean(shares):.1%} of the pixels"
+        check = Check("saturated depth", Verdict.ASSUMED, says)
+    return replace(streams, depth=masked, checks=(*streams.checks, check))
+
+
+def _limit(dtype: np.dtype) -> float | None:
+    """The greatest number of a type of 16 bits."""
+    return float(np.iinfo(dtype).max) if dtype.kind in "iu" and dtype.itemsize == 2 else None
+
+
+def _saturated(counts: Num[np.ndarray, "H W"]) -> float | None:
+    """The reading of a picture that stands for none; None where there is none."""
+    readings = counts[np.isfinite(counts) & (counts > 0)]
+    if not readings.size:
+        return None
+    most = float(readings.max())
+    if most == _limit(counts.dtype):
+        return most
+    others = readings[readings < most]
+    often = 1 - others.size / readings.size >= _FAR_SHARE
+    return most if often and others.size and most >= _FAR * float(np.median(others)) else None
+
+
+def _read_masked(read: Callable[[int], np.ndarray], far: float | None, index: int) -> np.ndarray:
+    """Decode a depth picture; readings that are none are 0."""
+    counts = read(index)
+    none = [value for value in (far, _limit(counts.dtype)) if value is not None]
+    return np.where(np.isin(counts, none), 0, counts) if none and np.isin(counts, none).any() else counts
+
+
+# --- pictures that come again -----------------------------------------------------------------------------
+
+
+def find_repeats(
+    streams: Streams,
+    color: Mapping[int, PictureDigest],
+    depth: Mapping[int, PictureDigest],
+    rows: Int64[np.ndarray, "T 2"],
+    state: Num[np.ndarray, "T S"],
+) -> tuple[dict[int, str], Check]:
+    """Rows whose picture is that of a row before, while time went on, and what to say of it.
+
+    Args:
+        streams: The recording.
+        color: What is kept of color pictures, by index.
+        depth: Likewise of depth pictures.
+        rows: Indices of the color and depth picture of every row that is good otherwise.
+        state: What the robot was at each.
+
+    Returns:
+        The reason of every row that is bad, by its place in ``rows``; and the check.
+    """
+    kept = [[color[int(c)] for c, _ in rows], [depth[int(d)] for _, d in rows]]
+    same = [np.array([_equal(a, b) for a, b in pairwise(k)], bool) for k in kept]
+    change = [np.array([_change(a, b) for a, b in pairwise(k)]) for k in kept]
+    bad: dict[int, str] = {}
+    named, still = [], 0
+    for which, (stream, other) in enumerate(((streams.color, 1), (streams.depth, 0))):
+        for first, last in _runs(same[which]):
+            moved = not same[other][first:last].all() or _robot_moved(state, first, last)
+            froze = moved or _jumped(change[which], last)
+            if last - first + 1 >= _RUN and froze:
+                why = f"equals {_name(stream, rows, first, which)} bit by bit, as {last - first} in a row do: it froze"
+                bad.update({k: f"{_name(stream, rows, k, which)} {why}" for k in range(first + 1, last + 1)})
+            elif moved:
+                named.append(_name(stream, rows, last, which))
+            else:
+                still += last - first
+    says = f"{len(bad)} rows are of a picture that froze" if bad else "no picture froze"
+    if named:
+        says += f"; {len(named)} pictures equal the one before: {', '.join(named[:3])}"
+    if still:
+        says += f"; {still} equal the one before while nothing else moved, as in a scene that stands still"
+    many = bool(bad) or len(named) > _MANY * len(rows)
+    verdict = Verdict.DOUBTFUL if many else Verdict.ASSUMED if still or named else Verdict.OK
+    return bad, Check("repeats", verdict, says)
+
+
+def _name(stream: ImageStream, rows: Int64[np.ndarray, "T 2"], row: int, which: int) -> str:
+    return stream.names[int(rows[row][which])]
+
+
+def _equal(a: PictureDigest, b: PictureDigest) -> bool:
+    """Whether two pictures are the same, and have anything in them by which that could be told."""
+    return a.checksum == b.checksum and np.ptp(a.small) > 0
+
+
+def _change(a: PictureDigest, b: PictureDigest) -> float:
+    """How much has changed between two pictures."""
+    return float(np.abs(a.small - b.small).mean()) if a.small.shape == b.small.shape else 0.0
+
+
+def _runs(same: np.ndarray) -> list[tuple[int, int]]:
+    """First and last row of every run of equal pictures."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _robot_moved(state: Num[np.ndarray, "T S"], first: int, last: int) -> bool:
+    """Whether the state changed while the picture did not."""
+    reach = np.ptp(state, axis=0) if state.shape[1] else np.zeros(0)
+    return bool((np.ptp(state[first : last + 1], axis=0)[reach > 0] > _MOVED * reach[reach > 0]).any())
+
+
+def _jumped(change: np.ndarray, last: int) -> bool:
+    """Whether much more than usual changed from the last picture of a run to the next."""
+    usual = np.delete(change, last) if last < len(change) else change
+    usual = usual[usual > 0]
+    return bool(last < len(change) and len(usual) and change[last] > _JUMP * np.median(usual))

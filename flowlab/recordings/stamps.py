@@ -1,0 +1,179 @@
+"""The unit of stamps: stated by a standard or by the user, else decided by evidence, else asked for."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from flowlab.errors import DataError
+
+Unit = Literal["s", "ms", "us", "ns"]
+SECONDS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+EPOCH_S = (1e9, 4e9)
+"""Stamps that count from 1970 lie between these, the years 2001 and 2096 [s]."""
+PICTURE_STEP_S = (1 / 240, 10.0)
+"""What may lie between two pictures of a camera [s]."""
+SAMPLE_STEP_S = (1 / 4000, 10.0)
+"""What may lie between two samples of a robot [s]."""
+LARGEST_COUNT = 10
+"""Numbers of frames of which at most every so many-th was kept; what steps farther counts something else."""
+RATE_TOLERANCE = 0.25
+"""A rate this share off another one contradicts it."""
+
+
+class UnclearStamps(DataError):
+    """Raised where a unit is not known or cannot be; the message says what was found and what to write."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What a reader knows of the stamps of a stream, which it gives in the order in which the recording has them."""
+
+    source: str = "the times"
+    """What messages call the stamps, such as the file that they are from."""
+    unit: Unit | None = "s"
+    """None where neither a standard nor the layout says it: then it is decided by evidence."""
+    custom: Unit | None = None
+    """The unit that is the custom of the layout, where ``unit`` is None: taken unless the evidence is against it."""
+    integers: bool = False
+    """Whether they are written without a fraction, so that they may number frames."""
+    names: bool = False
+    """Whether they are numbers in the names of files, of which most number frames."""
+    overtaking: bool = False
+    """Whether parts may be recorded in another order than they were taken in, as messages may that overtake others."""
+    recorded_s: Float64[np.ndarray, "N"] | None = None
+    """When each was recorded, by the clock of the recorder [s]; stamps that are not finite are taken from here."""
+
+
+IN_SECONDS = Timing()
+
+
+def decide_unit(
+    stamps: Float64[np.ndarray, "N"], timing: Timing, *, fps: float | None, stated: Unit | None
+) -> Unit | Literal["frames"]:
+    """The unit of the stamps of pictures, or that they number frames.
+
+    Args:
+        stamps: They rise.
+        timing: What the reader knows of them.
+        fps: Pictures per second, where that is said.
+        stated: The unit as the user says it.
+
+    Raises:
+        UnclearStamps: They may be several things, or are not what is said of them.
+    """
+    step = _step(stamps)
+    if timing.unit is not None or stated is not None:
+        unit: Unit | Literal["frames"] = timing.unit or stated or "s"
+    else:
+        unit = epoch_unit(stamps) or _by_step(step, timing, fps)
+    if unit != "frames":
+        _check_step(step, unit, timing, PICTURE_STEP_S)
+        _check_rate(step, unit, timing, fps)
+    return unit
+
+
+def epoch_unit(stamps: Float64[np.ndarray, "N"]) -> Unit | None:
+    """The unit in which stamps count from 1970; None where they do not."""
+    for unit, seconds in SECONDS.items():
+        if EPOCH_S[0] <= float(np.median(stamps)) * seconds <= EPOCH_S[1]:
+            return unit  # type: ignore[return-value]
+    return None
+
+
+def _step(stamps: Float64[np.ndarray, "N"]) -> float:
+    """The usual step; nan for fewer than two stamps."""
+    steps = np.diff(stamps)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else np.nan
+
+
+def _units(step: float, bounds: tuple[float, float]) -> list[Unit]:
+    """The units in which a step is plausible."""
+    return [unit for unit, s in SECONDS.items() if bounds[0] * 0.999 <= step * s <= bounds[1]]  # type: ignore[misc]
+
+
+def _by_step(step: float, timing: Timing, fps: float | None) -> Unit | Literal["frames"]:
+    """The unit in which a step is plausible, and agrees with ``fps``."""
+    numbers = timing.integers and not step > LARGEST_COUNT
+    units: list[Unit | Literal["frames"]] = [*_units(step, PICTURE_STEP_S)]
+    if fps is not None:
+        units = [u for u in units if _agree(1 / (step * SECONDS[u]), fps)]
+        # Where frame numbers over fps and a unit come to the same, it does not matter which they are.
+        units = ["frames", *(u for u in units if not _agree(SECONDS[u], 1 / fps))] if numbers else units
+    elif numbers or (timing.names and timing.integers and timing.custom is None):
+        units = ["frames", *units]
+    elif timing.custom in units:
+        units = [timing.custom]
+    if len(units) == 1 and (units != ["frames"] or fps is not None):
+        return units[0]
+    found = f"{timing.source} step by {step:g}{'' if fps is None else f' where fps is {fps:g}'}"
+    if not units:
+        raise UnclearStamps(f"{found}: no plausible time in {_or(SECONDS)}, and no numbers of frames; {_write(fps)}")
+    raise UnclearStamps(f"when the pictures were taken is not known: {found} and may be {_or(units)}; {_write(fps)}")
+
+
+def _check_step(step: float, unit: str, timing: Timing, bounds: tuple[float, float]) -> None:
+    """Refuse a step that no camera has."""
+    took = step * SECONDS[unit]
+    if np.isfinite(took) and not bounds[0] * 0.999 <= took <= bounds[1]:
+        likely = [u for u in _units(step, bounds) if u != unit]
+        write = f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s" if likely else _write(1)
+        raise UnclearStamps(
+            f"{timing.source} step by {took:.3g} s if they are in {unit}, expected {bounds[0]:.2g} to {bounds[1]:g} s "
+            f"between pictures; {write}"
+        )
+
+
+def _check_rate(step: float, unit: str, timing: Timing, fps: float | None) -> None:
+    """Refuse a rate that is not as said."""
+    rate = 1 / (step * SECONDS[unit])
+    if fps is not None and np.isfinite(rate) and not _agree(rate, fps):
+        raise UnclearStamps(
+            f"{timing.source} are times in {unit}, {rate:.3g} pictures a second, and 'fps: {fps:g}' contradicts them; "
+            "leave fps out, or correct it"
+        )
+
+
+def decide_sample_unit(
+    stamps: Float64[np.ndarray, "N"], timing: Timing, pictures_s: Float64[np.ndarray, "F"], stated: Unit | None
+) -> Unit:
+    """The unit of the stamps of samples: the one in which they lie where the pictures do.
+
+    Raises:
+        UnclearStamps: None does, or several do.
+    """
+    if timing.unit is not None or stated is not None:
+        return timing.unit or stated or "s"
+    if (epoch := epoch_unit(stamps)) is not None:
+        return epoch
+    step = _step(stamps)
+    units = _units(step, SAMPLE_STEP_S) or [timing.custom or "s"]
+    fitting = [u for u in units if _covered(stamps * SECONDS[u], pictures_s) >= 0.5]
+    if len(fitting or units) != 1:
+        raise UnclearStamps(f"{timing.source} step by {step:g} and may be {_or(units)}; write 'time_unit: ms', say")
+    return (fitting or units)[0]
+
+
+def _covered(time_s: Float64[np.ndarray, "N"], pictures_s: Float64[np.ndarray, "F"]) -> float:
+    """The share of the longer of two spans in which both lie."""
+    both = min(time_s[-1], pictures_s[-1]) - max(time_s[0], pictures_s[0])
+    return float(both / max(np.ptp(time_s), np.ptp(pictures_s), 1e-9))
+
+
+def _agree(rate: float, fps: float) -> bool:
+    """Whether two rates are the same, roughly."""
+    return abs(rate / fps - 1) <= RATE_TOLERANCE
+
+
+def _or(units: Iterable[str]) -> str:
+    """Units in words."""
+    return " or ".join("numbers of frames" if u == "frames" else u for u in units)
+
+
+def _write(fps: float | None) -> str:
+    """What to write where it is not clear."""
+    frames = "" if fps is not None else "'fps: 30' where they number frames, or "
+    return f"write {frames}'time_unit: ms' for their unit (s, ms, us or ns), or give 'times', a file with them"
