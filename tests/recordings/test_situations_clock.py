@@ -242,7 +242,7 @@ def test_state_in_another_unit_lies_where_the_pictures_do(
     path = write(tmp_path / "r", *streams, fps=FPS, state="s.csv")
     rows = "".join(f"{t / 50 * scale:.{digits}f},{t}\n" for t in range(5 * STEPS))
     (path / "s.csv").write_text("time,x\n" + rows)
-    assert_fine(inspect(path))["sync_ms"]["state"][1] == pytest.approx(0, abs=1)
+    assert assert_fine(inspect(path))["sync_ms"]["state"][1] == pytest.approx(0, abs=1)
     (path / "s.csv").write_text("time,x\n" + "".join(f"{EPOCH + t / 50},{t}\n" for t in range(5 * STEPS)))
     assert_refused(inspect(path), "their clocks differ; write 'state_offset_s: ...'")
     write(path, {}, {}, fps=FPS, state="s.csv", state_offset_s=-EPOCH)
@@ -267,7 +267,7 @@ def write_messages(
             say("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", now, m.info(INTRINSICS, stamp))
             for k in range(5):
                 at = now + k * 20_000_000
-                joints = m.joints(np.full(3, float(t)), at - round((behind_s + drift * t / STEPS) * 1e9))
+                joints = m.joints(np.full(3, float(t)), at - round((behind_s + drift * (t + k / 5) / STEPS) * 1e9))
                 say("/joint_states", "sensor_msgs/msg/JointState", at, joints)
 
     write_yaml(path.with_suffix(".yaml"), **keys)
