@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -81,7 +82,10 @@ def recordings(draw: st.DrawFn) -> tuple[Truth, list[Any], list[Timing], Metadat
             truth = Truth(whole, whole[late:], truth.state_s, truth.step_s)
             counted = [np.arange(count), np.arange(count - late)]
         if kind == "origins":
-            counted[1] = counted[1] + draw(st.sampled_from([1, -1, 7]))
+            shift = draw(st.sampled_from([1, -1, 7]))
+            # A loss at one end that makes up for the shift leaves no trace in the numbers.
+            hypothesis.assume((counted[0][[0, -1]] == counted[1][[0, -1]]).all())
+            counted[1] = counted[1] + shift
         first = draw(st.sampled_from([0, 1])) if kind != "origins" else 0
         counts = Timing("names", unit=None, integers=True, names=True)
         counts2 = Timing("names of depth", unit=None, integers=True, names=True)
