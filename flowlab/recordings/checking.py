@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from flowlab.recordings.left_out import check_widths_known, find_left_out
 from flowlab.recordings.verdicts import Check, Verdict
 
 if TYPE_CHECKING:
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
 def check_recording(source: "ParsedRecording") -> Iterator[Check]:
     """What is looked at in a recording whose layout is understood, and what came of it."""
     yield _registration(source)
+    yield from check_widths_known(source)
+    yield from find_left_out(source)
 
 
 def _registration(source: "ParsedRecording") -> Check:
