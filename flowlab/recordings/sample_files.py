@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Num
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream
-from flowlab.recordings.stamps import Timing
+from flowlab.recordings.stamps import Timing, rough_seconds
 from flowlab.recordings.tables import base_and_unit, find_columns, read_table
 
 
@@ -38,9 +38,10 @@ def load_samples(
     color: ImageStream,
     write_to: str,
     columns: Sequence[str] | None = None,
+    fps: float | None = None,
 ) -> SampleStream:
     """Rows of numbers: with times of their own (a file, or a column of times), else one per color picture."""
-    found = find_columns(read_table(path), name, columns, color.time_s, times is not None)
+    found = find_columns(read_table(path), name, columns, rough_seconds(color.time_s, color.timing, fps), bool(times))
     own = None if found.time is None else check_times(path, found.time, not (found.time % 1).any(), found.unit_known)
     if times is not None:
         own = load_times(times)
