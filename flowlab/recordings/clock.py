@@ -18,8 +18,10 @@ from flowlab.recordings.verdicts import Check, Verdict
 
 _APART_S = 0.5
 """Streams whose spans lie this far apart have nothing in common."""
-_IN_ORDER = 0.25
+_IN_ORDER = 0.5
 """Stamps sorted by time are those of one clock where none follows sooner than this share of the usual step."""
+_OVERTAKEN = 2.5
+"""Messages that overtake others do so by no more than this many steps."""
 _GAPPY = 0.5
 """Share of the time that gaps may take before that is doubtful."""
 AnyStream = TypeVar("AnyStream", ImageStream, SampleStream)
@@ -110,7 +112,8 @@ def _in_order(stream: AnyStream, name: str, recorded: bool) -> AnyStream:
         return replace(stream, time_s=stamps)
     order = np.argsort(stamps, kind="stable")
     steps = np.diff(stamps[order])
-    if timing.overtaking and steps.min() >= _IN_ORDER * np.median(steps):
+    usual = np.median(steps)
+    if timing.overtaking and steps.min() >= _IN_ORDER * usual and -np.diff(stamps).min() <= _OVERTAKEN * usual:
         return _reordered(replace(stream, time_s=stamps), order)
     at = int(back[0])
     unit = "" if timing.unit is None else f" {timing.unit}"

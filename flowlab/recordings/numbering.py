@@ -9,9 +9,8 @@ from flowlab.recordings.verdicts import Check, Verdict
 def check_numbers(color: Float64[np.ndarray, "N"], depth: Float64[np.ndarray, "M"], name: str, stated: bool) -> Check:
     """Whether the frame numbers of color and depth are those of one counter.
 
-    Numbers without a hole that begin at the same number and do not end at the same, or that begin and end as far
-    apart, may have been given to each stream by itself: then depth belongs to another color picture than its number
-    says, and nothing in the numbers tells.
+    Numbers that begin at the same and do not end at the same, or that begin one apart, or are shifted as a whole, may
+    have been given to each stream by itself: then depth belongs to another color picture than its number says.
 
     Args:
         color: Of the color pictures, rising.
@@ -29,9 +28,9 @@ def check_numbers(color: Float64[np.ndarray, "N"], depth: Float64[np.ndarray, "M
         verdict = "the same"
     elif not len(np.intersect1d(color, depth)):
         why = "no picture of one has the number of one of the other"
-    elif {color[0], depth[0]} == {0, 1} or first * last > 0:
+    elif {color[0], depth[0]} == {0, 1} or first * last > 0 or (abs(first) == 1 and last == 0):
         why = "they may be counted from different ones"
-    elif first == 0 and _is_dense(color if last > 0 else depth):
+    elif first == 0:
         why = "each stream may have been counted by itself, and frames be missing at the start of one"
     else:
         verdict = "one counter's, by where they begin, end and have holes"
@@ -43,9 +42,3 @@ def check_numbers(color: Float64[np.ndarray, "N"], depth: Float64[np.ndarray, "M
         f"{span}: {why}; if equal numbers belong together, write '{key}: 0', else how many seconds to add to the "
         f"times of {name}, or give the times of both in files",
     )
-
-
-def _is_dense(numbers: Float64[np.ndarray, "N"]) -> bool:
-    """Whether they have no hole."""
-    steps = np.diff(numbers)
-    return bool(not len(steps) or (steps == steps[0]).all())

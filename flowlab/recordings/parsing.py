@@ -181,6 +181,6 @@ def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
         if file is not None:
             where = None if times is None else folder / times
             columns = getattr(metadata, f"{name}_columns")
-            samples = load_samples(folder / file, name, where, streams.color, FILE_NAME, columns)
+            samples = load_samples(folder / file, name, where, streams.color, FILE_NAME, columns, metadata.fps)
             changed[name] = (samples,)
     return replace(streams, **changed)

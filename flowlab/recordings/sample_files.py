@@ -8,27 +8,27 @@ from jaxtyping import Float32, Float64, Num
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream
-from flowlab.recordings.stamps import Timing, Unit
+from flowlab.recordings.stamps import Timing, rough_seconds
 from flowlab.recordings.tables import base_and_unit, find_columns, read_table
 
 
 def load_times(path: Path) -> tuple[Float64[np.ndarray, "N"], Timing]:
-    """Times of a file, one a line or as a numpy array, as they stand there or in seconds, and what is known of them."""
+    """Times of a file, one a line or as a numpy array, and what is known of them."""
     table = read_table(path)
     if table.values.shape[1] != 1 or table.text:
         raise DataError(f"{path}: has {table.values.shape[1]} numbers a line, expected one time")
-    scale = base_and_unit(table.names[0])[1] if table.names else None
-    return check_times(path, table.values[:, 0] * (scale or 1.0), None if scale is None else "s", integers=table.whole)
+    unit = base_and_unit(table.names[0])[1] if table.names else None
+    return check_times(path, table.values[:, 0] * (unit or 1.0), table.integers, unit is not None)
 
 
 def check_times(
-    path: Path, time: Num[np.ndarray, "N"], unit: Unit | None = None, *, integers: bool = False
+    path: Path, time: Num[np.ndarray, "N"], integers: bool, in_seconds: bool = False
 ) -> tuple[Float64[np.ndarray, "N"], Timing]:
-    """The same times, where they are finite; in which unit they are is decided elsewhere, where it is not stated."""
+    """The same times, where they are finite; in which unit they are is decided elsewhere, where nothing states it."""
     if not np.isfinite(time).all():
         at = int(np.argmin(np.isfinite(time)))
         raise DataError(f"{path}: entry {at + 1} ({time[at]}) is no time")
-    return time.astype(np.float64), Timing(path.name, unit=unit, integers=unit is None and integers)
+    return time.astype(np.float64), Timing(path.name, unit="s" if in_seconds else None, integers=integers)
 
 
 def load_samples(
@@ -38,13 +38,11 @@ def load_samples(
     color: ImageStream,
     write_to: str,
     columns: Sequence[str] | None = None,
+    fps: float | None = None,
 ) -> SampleStream:
     """Rows of numbers: with times of their own (a file, or a column of times), else one per color picture."""
-    table = read_table(path)
-    clock = color.time_s if color.timing.unit is not None else color.time_s[:0]  # numbers of frames are no clock
-    found = find_columns(table, name, columns, clock, times is not None)
-    unit: Unit | None = "s" if found.unit_known else None
-    own = None if found.time is None else check_times(path, found.time, unit, integers=table.whole)
+    found = find_columns(read_table(path), name, columns, rough_seconds(color.time_s, color.timing, fps), bool(times))
+    own = None if found.time is None else check_times(path, found.time, not (found.time % 1).any(), found.unit_known)
     if times is not None:
         own = load_times(times)
     where, timing = (color.time_s, color.timing) if own is None else own

@@ -83,6 +83,14 @@ def epoch_unit(stamps: Float64[np.ndarray, "N"]) -> Unit | None:
     return None
 
 
+def rough_seconds(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None) -> Float64[np.ndarray, "_"]:
+    """About when pictures were taken [s], to compare with before the unit is decided; nothing where that is open."""
+    unit = timing.unit or epoch_unit(stamps)
+    if unit is not None:
+        return stamps * SECONDS[unit]
+    return stamps / fps if fps is not None and timing.integers else np.empty(0)
+
+
 def _step(stamps: Float64[np.ndarray, "N"]) -> float:
     """The usual step; nan for fewer than two stamps."""
     steps = np.diff(stamps)

@@ -49,8 +49,8 @@ class Table:
     """nan for what is no number in a column of text."""
     text: frozenset[int] = frozenset()
     """Columns that hold text, as a frame's name."""
-    whole: bool = False
-    """Whether the first column is written as integers."""
+    integers: bool = False
+    """Whether all numbers are written without a fraction."""
 
     def column(self, name: str) -> int:
         """The place of a column. Raises :class:`DataError` with the names there are."""
@@ -83,7 +83,7 @@ def read_table(path: Path) -> Table:
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or not len(values):
         raise DataError(f"{path}: has the shape {cut(str(values.shape))}, expected (rows, numbers)")
-    return Table(path, (), values.astype(np.float64), whole=values.dtype.kind in "iu")
+    return Table(path, (), values.astype(np.float64), integers=values.dtype.kind in "iu")
 
 
 def parse_table(path: Path, text: str) -> Table:
@@ -117,8 +117,8 @@ def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -
             )
             raise DataError(f"{path}: line {n} is not {width} numbers: {shown(' '.join(row))}{comma}")
         rows.append([np.nan if k in text else float(x) for k, x in enumerate(row)])
-    whole = all(row[0].lstrip("+-").isdecimal() for _, row in cells)
-    return Table(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text), whole)
+    integers = all(x.lstrip("+-").isdecimal() for _, row in cells for x in row)
+    return Table(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text), integers)
 
 
 def _splitter(path: Path, lines: Sequence[str]):  # type: ignore[no-untyped-def]

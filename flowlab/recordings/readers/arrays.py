@@ -161,7 +161,7 @@ def _times(store: _Store, steps: int, given: Metadata) -> tuple[np.ndarray, Timi
         if time_s.shape != (steps,) or time_s.dtype.kind not in "iuf":
             found = f"{time_s.dtype} {cut(str(time_s.shape))}"
             raise DataError(f"{store.path}: '{store.names['time']}' is {found}, expected numbers ({steps},)")
-        stamps, timing = check_times(store.path, np.asarray(time_s), integers=time_s.dtype.kind in "iu")
+        stamps, timing = check_times(store.path, np.asarray(time_s), time_s.dtype.kind in "iu")
         return stamps, replace(timing, source=f"'{store.names['time']}'")
     if given.fps is None:
         where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name

@@ -1,7 +1,7 @@
 """ROS 1 bags and ROS 2 recordings (mcap, db3), through the ``rosbags`` package."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -207,10 +207,9 @@ class _Topic:
     name: str
     index: BagIndex
 
-    def timing(self, messages: np.ndarray | slice = slice(None)) -> Timing:
-        """What is known of the stamps of some messages, which ROS has in seconds."""
-        recorded_s = self.index.recorded_ns[messages] * 1e-9
-        return Timing(f"the stamps of {self.name}", overtaking=True, recorded_s=recorded_s)
+    def timing(self) -> Timing:
+        """What is known of its stamps, which ROS has in seconds."""
+        return Timing(f"the stamps of {self.name}", overtaking=True, recorded_s=self.index.recorded_ns * 1e-9)
 
     def pictures(self) -> ImageStream:
         """Its messages as pictures."""
@@ -228,8 +227,10 @@ class _Topic:
             groups, checks = [_unnamed(place, what, messages)], []
         streams = []
         for k, group in enumerate(groups):
-            name = what if k == 0 else f"{what} {k + 1}"
-            stamps, timing = self.index.measured_s[group.messages], self.timing(group.messages)
+            name, timing = what if k == 0 else f"{what} {k + 1}", self.timing()
+            assert timing.recorded_s is not None
+            timing = replace(timing, recorded_s=timing.recorded_s[group.messages])
+            stamps = self.index.measured_s[group.messages]
             streams.append(SampleStream(name, stamps, group.positions, timing, columns=group.names))
         return tuple(streams), checks
 
