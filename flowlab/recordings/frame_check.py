@@ -1,14 +1,15 @@
 """The first pass over a recording: which frames make rows, and which are bad, by name and reason."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.frame_processing import Size
+from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.sync import nearest_sample
 
 
@@ -38,6 +39,8 @@ class FrameCheck:
     """Median depth reading of the first good row, in counts."""
     sync_s: Mapping[str, Float64[np.ndarray, "F"]] = field(default_factory=dict)
     """How far from each color frame its depth and its state are, bad ones included."""
+    samples: tuple[PictureSample, ...] = ()
+    """Small pictures of some rows, evenly spaced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,8 @@ class _ImageCheck:
     reason: str = ""
     """Why it is bad; empty where it is good."""
     median: float = 0.0
+    kept: tuple[np.ndarray, int] | None = None
+    """The picture shrunk, and by how much, where it is one of those to keep."""
 
 
 def check_frames(
@@ -64,8 +69,13 @@ def check_frames(
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
-    color = {int(i): _look(streams.color, int(i), _look_at_color) for i in frames}
-    depth = {int(i): _look(streams.depth, int(i), _look_at_depth) for i in np.unique(match[off <= max_sync_s])}
+    kept = sorted(chosen(len(frames)))
+    keep_color, keep_depth = set(frames[kept].tolist()), set(match[kept].tolist())
+    color = {int(i): _look(streams.color, int(i), _look_at_color, int(i) in keep_color) for i in frames}
+    depth = {
+        int(i): _look(streams.depth, int(i), _look_at_depth, int(i) in keep_depth)
+        for i in np.unique(match[off <= max_sync_s])
+    }
     color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
     good, bad, last = [], [], -np.inf
     for k, (i, j) in enumerate(zip(frames.tolist(), match.tolist(), strict=True)):
@@ -85,7 +95,18 @@ def check_frames(
     rows = np.array(good, np.int64).reshape(-1, 2)
     median = depth[good[0][1]].median if good else 0.0
     sync = {"depth": off, **off_state}
-    return FrameCheck(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync)
+    samples = tuple(_samples(good, color, depth))
+    return FrameCheck(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, samples)
+
+
+def _samples(
+    rows: list[tuple[int, int]], color: Mapping[int, _ImageCheck], depth: Mapping[int, _ImageCheck]
+) -> Iterator[PictureSample]:
+    """The rows of which both pictures were kept."""
+    for row, (i, j) in enumerate(rows):
+        gray, counts = color[i].kept, depth[j].kept
+        if gray is not None and counts is not None:
+            yield PictureSample(row, gray[0], counts[0], gray[1], counts[1])
 
 
 def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | None) -> Int64[np.ndarray, "F"]:
@@ -94,10 +115,17 @@ def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | No
     return np.flatnonzero((since >= start_s) & (since <= (np.inf if stop_s is None else stop_s)))[::every]
 
 
-def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageCheck]) -> _ImageCheck:
-    """Decode one picture and judge it."""
+def _look(
+    stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageCheck], keep: bool = False
+) -> _ImageCheck:
+    """Decode one picture and judge it; kept is one that is good."""
     try:
-        return judge(stream.read(index))
+        picture = stream.read(index)
+        found = judge(picture)
+        if not keep or found.reason:
+            return found
+        small = small_gray(picture) if picture.ndim == 3 else small_depth(picture)
+        return replace(found, kept=(small, shrink_factor(picture)))
     except BadImage as error:
         return _ImageCheck((0, 0), str(error))
 
