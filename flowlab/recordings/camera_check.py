@@ -170,8 +170,8 @@ def _view_deg(given: Intrinsics, size: _Size) -> tuple[float, float]:
 def _as_it_is(about: str, given: Intrinsics, size: _Size) -> Check:
     """What is said of intrinsics that may be right."""
     width, height = _view_deg(given, size)
-    says = (f"fx {given.fx:.5g}, fy {given.fy:.5g}, a field of view of {width:.0f} x {height:.0f} degrees, the principal "
-            f"point at {given.cx / size[0]:.0%} and {given.cy / size[1]:.0%} of the picture; ")  # fmt: skip
+    says = (f"fx {given.fx:.5g}, fy {given.fy:.5g}, a field of view of {width:.0f} x {height:.0f} degrees, the "
+            f"principal point at {given.cx / size[0]:.0%} and {given.cy / size[1]:.0%} of the picture; ")  # fmt: skip
     if given.lens is None:
         return Check(about, Verdict.OK, f"{says}no distortion")
     bend = _bend_px(given, size)

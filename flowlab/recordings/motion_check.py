@@ -78,9 +78,10 @@ def check_motion(source: "ParsedRecording") -> Check:
     steps = [m.px * a.color_factor for a, b, m in moving]
     mean = np.mean([m.share for _, _, m in moving])
     a = moving[int(np.argmax(steps))][0]
+    far = f"{max(steps):.1f} px{_meters(source, a, max(steps))}"
     return Check("camera", Verdict.DOUBTFUL, f"it moves, and is taken as fixed: between {len(moving)} of {len(told)} "
-                 f"pairs of pictures {mean:.0%} of the textured picture moves, by {max(steps):.1f} px{_meters(source, a, max(steps))} "
-                 f"at most (from row {a.row}); tracks are then in the moving camera's frame")  # fmt: skip
+                 f"pairs of pictures {mean:.0%} of the textured picture moves, by {far} at most (from row {a.row}); "
+                 "tracks are then in the moving camera's frame")  # fmt: skip
 
 
 def _pairs(samples: Sequence[PictureSample]) -> list[tuple[PictureSample, PictureSample]]:

@@ -51,6 +51,10 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
         yield Check("world", Verdict.ASSUMED, says)
         return
     T = np.array(source.metadata.T_world_cam, float)
+    if np.allclose(T[:3, :3], np.eye(3), atol=1e-6):
+        says = "T_world_cam turns nothing, so the world has the camera's axes: x right, y down, z forward"
+        yield Check("world", Verdict.ASSUMED, says)
+        return
     stands = f"{_stands(T)}, from {source.origin.get('T_world_cam', '')}"
     far = float(np.linalg.norm(T[:3, 3]))
     if far > _FAR_M[0]:
@@ -68,8 +72,8 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
 def _baseline(far: float, write_to: str) -> Iterator[Check]:
     if far > _BASELINE_M[0]:
         verdict = Verdict.REFUSED if far > _BASELINE_M[1] else Verdict.DOUBTFUL
-        yield Check("T_color_depth", verdict, f"the depth camera is {far:.4g} m from the color camera; it must be in "
-                    f"meters, and map coordinates of the depth camera to the color camera; correct it in {write_to}")  # fmt: skip
+        yield Check("T_color_depth", verdict, f"the depth camera is {far:.4g} m from the color camera; it must be "
+                    f"in meters, and map coordinates of the depth camera to the color camera; correct it in {write_to}")  # fmt: skip
 
 
 def _stands(T: np.ndarray) -> str:
