@@ -24,7 +24,6 @@ _SIZES = (
     (3840, 2160),
 )  # fmt: skip
 """Sizes that cameras have, to say which one intrinsics may be of."""
-_WORST = (Verdict.REFUSED, Verdict.DOUBTFUL, Verdict.ASSUMED)
 
 
 def check_camera(about: str, given: Intrinsics, size: _Size, write_to: str) -> list[Check]:
@@ -49,6 +48,7 @@ def _faults(about: str, given: Intrinsics, size: _Size, write_to: str) -> Iterat
         given.lens  # noqa: B018
     except DataError as error:
         yield Verdict.REFUSED, f"{error}, in '{about}' in {write_to}"
+        return
     of = (given.width or size[0], given.height or size[1])
     if of != size:
         yield Verdict.REFUSED, _other_size(about, given, of, size, write_to)

@@ -83,9 +83,9 @@ def undistortion_maps(lens: Lens, K: np.ndarray, coefficients: tuple[float, ...]
     """Where to look in the distorted picture for every pixel of the ideal one of the same intrinsics."""
     D = padded(lens, coefficients)
     if lens is Lens.PINHOLE:
-        return cv2.initUndistortRectifyMap(K, D, np.eye(3), K, size, cv2.CV_32FC1)  # type: ignore[return-value]
+        return cv2.initUndistortRectifyMap(K, D, np.eye(3), K, size, cv2.CV_32FC1)
     if lens is Lens.FISHEYE:
-        return cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), K, size, cv2.CV_32FC1)  # type: ignore[return-value]
+        return cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), K, size, cv2.CV_32FC1)
     pixels = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1).reshape(-1, 1, 2).astype(float)
     # What leads from distorted to ideal is inverted as OpenCV inverts what leads from ideal to distorted.
     bent = _straightened(pixels, K, D, K).reshape(size[1], size[0], 2)
@@ -111,5 +111,5 @@ def undistorted_rays(
 def _straightened(pixels: np.ndarray, K: np.ndarray, D: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Ideal points of distorted ones, to well below a pixel; OpenCV 4 has a function of its own for that."""
     if hasattr(cv2, "undistortPointsIter"):
-        return cv2.undistortPointsIter(pixels, K, D, np.eye(3), P, _STEPS)  # type: ignore[no-any-return]
+        return cv2.undistortPointsIter(pixels, K, D, np.eye(3), P, _STEPS)
     return cv2.undistortPoints(pixels, K, D, None, np.eye(3), P, _STEPS)

@@ -43,7 +43,9 @@ def motion_between(a: PictureSample, b: PictureSample) -> CameraMotion | None:
     """How much of the picture moves; None where there is too little texture to tell."""
     if a.gray.shape != b.gray.shape or min(a.gray.shape) < _MIN_SIDE:
         return None
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(a.gray, b.gray, None)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(
+        a.gray, b.gray, np.zeros((*a.gray.shape, 2), np.float32)
+    )
     before, after = a.gray.astype(np.float32), b.gray.astype(np.float32)
     v, u = np.mgrid[: before.shape[0], : before.shape[1]].astype(np.float32)
     warped = cv2.remap(after, u + flow[..., 0], v + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

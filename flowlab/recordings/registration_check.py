@@ -133,7 +133,7 @@ def check_registration(source: "ParsedRecording") -> Check:
     if how is None:
         return Check("registration", Verdict.DOUBTFUL, "depth is seen from a camera of its own, and not registered yet")
     if source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None:
-        samples = _registered(source)
+        samples = tuple(_registered(source))
     elif source.frame_check.color_size != source.frame_check.depth_size:
         return Check("registration", Verdict.REFUSED, f"{how}, but has another size than color; give "
                      f"'depth_intrinsics' and 'T_color_depth' in {source.write_to}")  # fmt: skip

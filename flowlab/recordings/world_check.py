@@ -73,7 +73,8 @@ def _baseline(far: float, write_to: str) -> Iterator[Check]:
     if far > _BASELINE_M[0]:
         verdict = Verdict.REFUSED if far > _BASELINE_M[1] else Verdict.DOUBTFUL
         yield Check("T_color_depth", verdict, f"the depth camera is {far:.4g} m from the color camera; it must be "
-                    f"in meters, and map coordinates of the depth camera to the color camera; correct it in {write_to}")  # fmt: skip
+                    "in meters, and map coordinates of the depth camera to the color camera; "
+                    f"correct it in {write_to}")  # fmt: skip
 
 
 def _stands(T: np.ndarray) -> str:

@@ -115,7 +115,8 @@ def test_numbers_near_points_that_do_not_move_with_them_are_no_gripper(tmp_path:
         t = np.arange(len(e))[:, None]
         way = {
             "joint angles": 0.05 * np.sin(t * [0.9, 1.3, 0.7]),
-            "another frame": np.cumsum(np.tile([[-0.01, 0.0, 0.0]], (len(e), 1)), 0)[::-1] * [[1, 0, 0]] + 0.01 * t[::-1],
+            "another frame": np.cumsum(np.tile([[-0.01, 0.0, 0.0]], (len(e), 1)), 0)[::-1] * [[1, 0, 0]]
+            + 0.01 * t[::-1],
             "lies still": np.zeros((len(e), 3)),
         }[kind]
         start = e.state[:1, :3] + (e.state[-1:, :3] - e.state[:1, :3]) / 2

@@ -98,7 +98,7 @@ def intrinsics_of(info: Any, topic: str) -> Intrinsics | None:
     if K.size != 9 or not K[0] > 0:
         return None
     if not is_rectified(topic):
-        return _part(Intrinsics.from_matrix(K.reshape(3, 3), **distortion_of(info.distortion_model, D)), info)
+        return _part(Intrinsics.from_matrix(K.reshape(3, 3), **distortion_of(info.distortion_model, D.tolist())), info)
     if P.size == 12 and P[0] > 0:
         return _part(Intrinsics.from_matrix(P.reshape(3, 4)), info)
     if np.any(D):
