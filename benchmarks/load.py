@@ -69,7 +69,7 @@ def start_training(data: Path, out: Path) -> None:
     settings = load_settings("fast", "fdp")
     source = open_training_source(data)
     buffer = load_buffer(source, out)
-    fit_normalizer(source, buffer, infer_channels(source, buffer), settings)
+    fit_normalizer(buffer, infer_channels(source, buffer), settings)
 
 
 def read_with_zarr(folders: list[Path]) -> None:

@@ -6,6 +6,8 @@ MAX_YAML_BYTES = 1 << 18
 """Of a recipe, a profile, a ``recording.yaml``: they are written by hand."""
 MAX_YAML_NODES = 100_000
 """Values in a YAML file, those that aliases repeat counted each time."""
+MAX_FILES = 1_000_000
+"""Of a recording: ten hours of pictures of color and depth have two million, and nobody labels these as one."""
 MAX_NESTING = 64
 """Lists in lists, in JSON and YAML."""
 MAX_PIXELS = 64_000_000

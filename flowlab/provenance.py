@@ -82,7 +82,15 @@ class Provenance(Settings):
         return self
 
     def width_problem(self, state: int | None = None, action: int | None = None) -> str:
-        """What does not fit a state or an action of so many numbers, in words; empty where everything does."""
+        """What does not fit a state or an action.
+
+        Args:
+            state: How many numbers a state has; None where that is not asked.
+            action: The same of an action.
+
+        Returns:
+            What does not fit, in words; empty where everything does.
+        """
         for what, channels, width in (("state", self.state, state), ("action", self.action, action)):
             for c in channels or ():
                 if width is not None and max(c.index) >= width:

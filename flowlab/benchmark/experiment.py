@@ -17,7 +17,8 @@ from flowlab.evaluation.evaluate import evaluate_here
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
-from flowlab.policies.checkpoint import newest_checkpoint, read_run_config, read_trained, step_of
+from flowlab.policies.checkpoint import newest_checkpoint, read_trained, step_of
+from flowlab.policies.run_folder import read_run_config
 from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
 from flowlab.training import run

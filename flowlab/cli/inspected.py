@@ -27,6 +27,8 @@ def facts_of(one: InspectedRecording) -> dict[str, Any]:
         "calibration": dict(found.origin),
         "state_width": found.state_width,
         "action_width": found.action_width,
+        "state_names": list(found.state_names),
+        "action_names": list(found.action_names),
         "bad_frames": [[b.name, b.reason] for b in found.bad],
         "checks": [check.to_json() for check in found.checks],
         "problem": found.problem,

@@ -4,6 +4,7 @@ from dataclasses import asdict
 from typing import Any
 
 from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.errors import DataError
 from flowlab.pipeline.units import JobShard
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.overview import frame_count, left_out_frames, stage_totals, task_totals
@@ -33,14 +34,19 @@ def extraction_report(dataset: Dataset, seconds: float) -> dict[str, Any]:
 
 
 def finish_extraction(dataset: Dataset, seconds: float, share: JobShard, as_json: bool) -> None:
-    """Print what a command that fills a dataset has come to."""
+    """Print what a command that fills a dataset has come to. Raises :class:`DataError` where no episode came of it."""
     report = extraction_report(dataset, seconds)
     if as_json:
         print_json(report)
-        return
-    print_extraction(report)
+    else:
+        print_extraction(report)
     if dataset.missing and share.count > 1:
         say("the rest belongs to the other shards")
+    elif not len(dataset):
+        raise DataError(
+            f"{dataset.path}: holds no episode, for all {len(dataset.rejects)} that were tried are rejected; mend what "
+            "the reasons name, or change the settings, and run it again"
+        )
 
 
 def print_quality(about: dict[str, Any]) -> None:
@@ -69,7 +75,8 @@ def print_extraction(report: dict[str, Any]) -> None:
         echo(f"rejected {who} at {reject['stage']}: {reject['reason']}")
     if len(report["rejects"]) > _SHOWN:
         echo(f"... and {len(report['rejects']) - _SHOWN} more, all in {report['dataset']}/rejects.jsonl")
+    next_step = f" Next: flowlab validate {report['dataset']}" if report["episodes"] else ""
     echo(
         f"{report['episodes']} episodes, {report['frames']} frames in {report['dataset']} "
-        f"({report['wall_s']:.1f} s). Next: flowlab validate {report['dataset']}"
+        f"({report['wall_s']:.1f} s).{next_step}"
     )

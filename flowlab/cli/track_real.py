@@ -28,7 +28,8 @@ from flowlab.errors import DataError, UsageError
 @click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
-@click.option("--dry-run", is_flag=True, help="Say what is recognized and how long it would take; write nothing.")
+@click.option("--dry-run", is_flag=True, help="Say what is recognized; write nothing.")
+@click.option("--estimate", is_flag=True, help="With --dry-run: label some frames to tell how long all would take.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def track_real(
     paths: tuple[Path, ...],
@@ -47,6 +48,7 @@ def track_real(
     shard: str,
     repair: bool,
     dry_run: bool,
+    estimate: bool,
     as_json: bool,
 ) -> None:
     """Make a dataset of every RGB-D recording at or below the given paths, with estimated 3D-flow labels.
@@ -67,7 +69,7 @@ def track_real(
         raise UsageError("name the folder of the dataset, as in --out data/pour; or look first with --dry-run")
     known = {"tracker": tracker, "calibration": calibration, "weights": weights}
     if out is None or dry_run:
-        _dry_run(paths, task, workers, as_json, recipe=recipe, settings=changes, **known)
+        _dry_run(paths, task, workers, as_json, estimate, recipe=recipe, settings=changes, **known)
         return
     from flowlab.cli.reports import finish_extraction
     from flowlab.pipeline.labeling import label
@@ -82,10 +84,12 @@ def track_real(
     finish_extraction(dataset, time.monotonic() - start, share, as_json)
 
 
-def _dry_run(paths: tuple[Path, ...], task: str | None, workers: int | None, as_json: bool, **recipe: Any) -> None:
-    """Say what is recognized of every recording, and how long labeling would take."""
+def _dry_run(
+    paths: tuple[Path, ...], task: str | None, workers: int | None, as_json: bool, estimate: bool, **recipe: Any
+) -> None:
+    """Say what is recognized of every recording, and if asked how long labeling would take."""
     from flowlab.cli.inspected import facts_of, lines_of
-    from flowlab.pipeline.inspection import estimate_labeling, inspect_recordings
+    from flowlab.pipeline.inspection import estimate_labeling, frame_count, inspect_recordings
     from flowlab.pipeline.labeling import find_jobs, labeling_recipe
 
     chosen = labeling_recipe(**recipe)
@@ -94,7 +98,7 @@ def _dry_run(paths: tuple[Path, ...], task: str | None, workers: int | None, as_
         inspected.append(one)
         if not as_json:
             echo(*lines_of(facts_of(one)))
-    plan = asdict(estimate_labeling(chosen, inspected, workers))
+    plan = asdict(estimate_labeling(chosen, inspected, workers)) if estimate else {"frames": frame_count(inspected)}
     if as_json:
         print_json({"recordings": [facts_of(one) for one in inspected]} | plan)
     else:

@@ -12,6 +12,7 @@ from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
+from flowlab.storage.trainable import training_problems
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,8 @@ def source_of(dataset: Dataset) -> TrainingSource:
         raise DataError(
             f"{dataset.path}: there are no episodes to train on yet; run the command that makes the dataset again"
         )
+    if problem := next(training_problems(dataset), ""):
+        raise DataError(f"{dataset.path}: {problem}")
     frames = sum(ref.frames for ref in dataset.refs)
     return TrainingSource(
         dataset.path,

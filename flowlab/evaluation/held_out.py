@@ -10,7 +10,8 @@ from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.policies.base import PolicySpec
-from flowlab.policies.checkpoint import RUN, LoadedPolicy, RunConfig, TrainedPolicy, check_observer, read_run_config
+from flowlab.policies.checkpoint import RUN, LoadedPolicy, TrainedPolicy, check_observer
+from flowlab.policies.run_folder import RunConfig, read_run_config
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.shard import Shard
 

@@ -10,18 +10,8 @@ from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
-from flowlab.policies.checkpoint import (
-    CHECKPOINTS,
-    POLICY,
-    RESUME,
-    RUN,
-    build_policy,
-    has_begun,
-    load_policy,
-    read_resume,
-    read_run_config,
-    read_trained,
-)
+from flowlab.policies.checkpoint import CHECKPOINTS, POLICY, RUN, build_policy, load_policy, read_trained
+from flowlab.policies.run_folder import RESUME, has_begun, read_resume, read_run_config
 from flowlab.storage.validation import Finding
 from flowlab.training.metrics import METRICS
 from flowlab.untrusted import read_json

@@ -86,16 +86,22 @@ class Observer:
     def sample(self, cloud: Cloud) -> Observation:
         """The farthest-point sample of a cloud."""
         if len(cloud.xyz_world) == 0:
-            raise DataError(
-                f"{self.task}: no point of the frame lies in the crop {self.settings.crop_for(self.task)}; "
-                "set observer.crop to the workspace of the scene"
-            )
+            raise DataError(self._nothing_there())
         index = farthest_points(cloud.xyz_world, self.settings.points)
         return Observation(pad(cloud.xyz_world[index], self.settings.points, self.settings.padding), len(index))
 
     def observe(self, frame: Frame) -> Observation:
         """What a policy sees of a frame."""
-        return self.sample(self.cloud(frame))
+        cloud = self.cloud(frame)
+        if not len(cloud.xyz_world):
+            raise DataError(f"{self._nothing_there()}; {_extent(frame)}")
+        return self.sample(cloud)
+
+    def _nothing_there(self) -> str:
+        return (
+            f"{self.task}: no point of the frame lies in the crop {self.settings.crop_for(self.task)}; "
+            "set observer.crop to the workspace of the scene"
+        )
 
     def _kept_owners(self, entities: tuple[Entity, ...]) -> np.ndarray:
         """Whether to keep a pixel, by owner; the last entry is for owner -1."""
@@ -103,3 +109,14 @@ class Observer:
             kept = [not self.settings.drop_background or e.role is not Role.BACKGROUND for e in entities]
             self._kept = (entities, np.array([*kept, True]))
         return self._kept[1]
+
+
+def _extent(frame: Frame) -> str:
+    """Where the points of a frame lie, in words."""
+    everywhere = np.full(3, np.inf)
+    owner, cam = np.full((1, 1), -1, np.int16), frame.camera
+    xyz, _ = unproject_and_crop(frame.depth, owner, np.ones(1, bool), cam.K, cam.T_world_cam, -everywhere, everywhere)
+    if not len(xyz):
+        return "the frame has no depth reading"
+    low, high = np.quantile(xyz, [0.01, 0.99], axis=0)
+    return f"its points lie in low=({', '.join(f'{x:.2f}' for x in low)}) high=({', '.join(f'{x:.2f}' for x in high)})"

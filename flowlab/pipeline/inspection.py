@@ -42,6 +42,11 @@ def inspect_recordings(recipe: Recipe, recordings: Sequence[Recorded]) -> Iterat
             yield InspectedRecording(recorded, None, str(error))
 
 
+def frame_count(inspected: Sequence[InspectedRecording]) -> int:
+    """Frames of those recordings that have no problem."""
+    return sum(x.description.rows for x in inspected if x.description is not None and x.problem is None)
+
+
 @dataclass(frozen=True, slots=True)
 class LabelingEstimate:
     """How long labeling what can be labeled takes."""
@@ -60,7 +65,7 @@ def estimate_labeling(
 ) -> LabelingEstimate:
     """How long labeling those recordings that have no problem takes, by the first frames of one of them."""
     cost = estimate_cost(recipe, [x.recorded for x in inspected])
-    frames = sum(x.description.rows for x in inspected if x.description is not None and x.problem is None)
+    frames = frame_count(inspected)
     seconds, workers = cost.cpu_s_per_frame, workers or core_count()
     return LabelingEstimate(
         frames=frames,

@@ -1,19 +1,22 @@
 """Datasets of recordings: their points are followed through the pictures."""
 
 import json
+import logging
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from flowlab.arguments import check_path, check_paths, check_settings
 from flowlab.engines.base import StartEngine
-from flowlab.errors import UsageError
+from flowlab.errors import FlowlabError, UsageError
 from flowlab.pipeline.filling import engine_for, fill
 from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler
 from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.pipeline.units import JobShard, WorkUnit
+from flowlab.recordings.identity import difference, identity
 from flowlab.recordings.metadata import FILE_NAME, combine, load_metadata
 from flowlab.recordings.recording import RecordingSettings, find_recordings
 from flowlab.storage.dataset import Dataset
@@ -21,6 +24,8 @@ from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
 from flowlab.text import is_plain_name, shown
+
+_LOG = logging.getLogger(__name__)
 
 
 def label(
@@ -103,7 +108,10 @@ def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) ->
         name = task or _task_said(place, settings) or place.parent.name
         if not is_plain_name(name):
             raise UsageError(f"{path}: {shown(name)} cannot be the name of a task; give one with --task")
-        found.append(Recorded(task=name, name=place.name, source=str(place)))
+        content = ""
+        with suppress(FlowlabError):  # opening it will say what is wrong, of it alone
+            content = identity(place, settings)
+        found.append(Recorded(task=name, name=place.name, source=str(place), content=content))
     return number_recordings((), found)
 
 
@@ -143,11 +151,11 @@ def label_recordings(
         requested=dict(Counter(r.task for r in recordings)),
         recordings=tuple(recordings),
     )
-    asked = {(r.task, r.name) for r in recordings}
+    asked = {r.source for r in recordings}
 
     def plan_for(manifest: Manifest) -> RecordingScheduler:
-        mine = [r for r in manifest.recordings if (r.task, r.name) in asked]
-        _forget_unopened(folder, {r.seed for r in mine if r.seed % share.count == share.index})
+        mine = [r for r in manifest.recordings if r.source in asked]
+        _forget_outdated(folder, {r.seed: r for r in mine if r.seed % share.count == share.index})
         return RecordingScheduler(mine)
 
     return fill(
@@ -155,8 +163,20 @@ def label_recordings(
     )
 
 
-def _forget_unopened(folder: Path, seeds: set[int]) -> None:
-    """Remove the receipts of recordings that could not be opened: their users were told how to mend them."""
+def _forget_outdated(folder: Path, recordings: Mapping[int, Recorded]) -> None:
+    """Remove the receipts of recordings that are to be labeled again, of which the user is told.
+
+    They have changed since; or they could not be opened, and their users were told how to mend them.
+    """
     for receipt in read_receipts(folder):
-        if receipt.rejects and seeds.issuperset(receipt.seeds) and all(x.retry for x in receipt.rejects):
+        if not set(receipt.seeds) <= recordings.keys():
+            continue
+        changed = [
+            f"{one.source}: {difference(content, one.content)} changed since it was labeled; it is labeled again"
+            for seed, content in zip(receipt.seeds, receipt.contents, strict=False)
+            if (one := recordings[seed]).content and content and content != one.content
+        ]
+        for sentence in changed:
+            _LOG.warning("flowlab: %s", sentence)
+        if changed or (receipt.rejects and all(x.retry for x in receipt.rejects)):
             (folder / "receipts" / f"{receipt.unit}.json").unlink(missing_ok=True)

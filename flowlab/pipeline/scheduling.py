@@ -75,7 +75,7 @@ class RecordingScheduler:
         done |= {(unit.task, seed) for unit in taken for seed in unit.seeds}
         for one in self.recordings:
             if (one.task, one.seed) not in done and one.seed % share.count == share.index:
-                yield WorkUnit(task=one.task, seeds=(one.seed,), sources=(one.source,))
+                yield WorkUnit(task=one.task, seeds=(one.seed,), sources=(one.source,), contents=(one.content,))
 
     def progress(self, receipts: Iterable[Receipt]) -> ExtractionProgress:
         """How far this run is."""

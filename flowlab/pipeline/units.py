@@ -14,6 +14,8 @@ class WorkUnit(Settings):
     seeds: tuple[int, ...]
     sources: tuple[str, ...] = ()
     """Path of the recording that each seed stands for; empty for simulation."""
+    contents: tuple[str, ...] = ()
+    """What each of these recordings is known by; empty for simulation."""
 
     @property
     def requests(self) -> list[EpisodeRequest]:

@@ -16,6 +16,7 @@ from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode
 from flowlab.storage import stats
 from flowlab.storage.receipts import Receipt, Reject, Widths, keep_receipt, known_widths, shard_path
+from flowlab.storage.recorded import CONTENT
 from flowlab.storage.shard import episode_digest
 
 
@@ -61,6 +62,7 @@ def run_unit(
             accepted=tuple(e.seed for e in episodes),
             frames=tuple(len(e) for e in episodes),
             digests=tuple(episode_digest(e) for e in episodes),
+            contents=_contents(unit, [*episodes, *kept]),
             shard_sha256=checksums["shards"],
             rejects_sha256=checksums["rejects"],
             rejects=(*rejects, *misfits),
@@ -70,6 +72,12 @@ def run_unit(
         )
         keep_receipt(folder, receipt)
     return receipt
+
+
+def _contents(unit: WorkUnit, episodes: Sequence[Episode]) -> tuple[str, ...]:
+    """What the recordings of a unit are known by: as they were when they were opened, which may be long after."""
+    opened = {e.seed: str(e.extras[CONTENT]) for e in episodes if CONTENT in e.extras}
+    return tuple(opened.get(seed, content) for seed, content in zip(unit.seeds, unit.contents, strict=False))
 
 
 def _fitting(episodes: Sequence[Episode], known: Widths | None, unit: WorkUnit) -> tuple[list[Episode], list[Reject]]:

@@ -1,8 +1,8 @@
 """What a reader is: it recognizes one layout of recordings, and gives its streams as they are."""
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64
 
 from flowlab.config import SettingsError
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
+from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.verdicts import Check
 from flowlab.registry import READERS, Plugin
@@ -47,6 +48,14 @@ class SampleStream:
     time_s: Float64[np.ndarray, "N"]
     """On the clock of the pictures [s]."""
     values: Float32[np.ndarray, "N D"]
+    columns: tuple[str, ...] = field(default=(), kw_only=True)
+    """What each number is called; empty where that is not known."""
+
+
+def channel_names(streams: Sequence[SampleStream]) -> list[str]:
+    """What the numbers of streams side by side are called; nothing where that is not known of all."""
+    named = bool(streams) and all(len(s.columns) == s.values.shape[1] for s in streams)
+    return [name for s in streams for name in s.columns] if named else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +211,8 @@ def choose_reader(path: Path, name: str | None = None) -> Reader:
         raise UsageError(f"{path}: the readers {names} both recognize it; choose one with --reader or the setting "
                          "recording.reader")  # fmt: skip
     if not able:
-        raise DataError(f"{path}: not a recording flowlab knows; looked for {expected_layouts(readers)}")
+        says = foreign_format(path) or f"not a recording flowlab knows; looked for {expected_layouts(readers)}"
+        raise DataError(f"{path}: {says}")
     return able[0]
 
 

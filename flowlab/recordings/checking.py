@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from flowlab.recordings.camera_check import check_camera
 from flowlab.recordings.depth_unit_check import check_depth_unit
+from flowlab.recordings.left_out import check_widths_known, find_left_out
 from flowlab.recordings.motion_check import check_motion
 from flowlab.recordings.registration_check import check_registration
 from flowlab.recordings.verdicts import Check
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 def check_recording(source: "ParsedRecording") -> Iterator[Check]:
     """What is looked at in a recording whose layout is understood, and what came of it."""
     yield from _geometry(source)
+    yield from check_widths_known(source)
+    yield from find_left_out(source)
 
 
 def _geometry(source: "ParsedRecording") -> Iterator[Check]:

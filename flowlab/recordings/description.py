@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from flowlab.errors import DataError
+from flowlab.recordings.base import channel_names
 from flowlab.recordings.frame_check import BadFrame
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.metadata import Metadata
@@ -55,6 +56,9 @@ class RecordingDescription:
     """Everything known of it, from all sources."""
     state_width: int
     action_width: int
+    state_names: tuple[str, ...]
+    """What the numbers of the state are called; empty where that is not known."""
+    action_names: tuple[str, ...]
     bad: tuple[BadFrame, ...]
     checks: tuple[Check, ...]
     """What was looked at, and what came of it."""
@@ -92,6 +96,8 @@ def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
         metadata=source.metadata,
         state_width=rows.state.shape[1],
         action_width=rows.action.shape[1],
+        state_names=tuple(channel_names(streams.state)),
+        action_names=tuple(channel_names(streams.action)),
         bad=seen.bad,
         checks=source.checks,
         problem=problem,

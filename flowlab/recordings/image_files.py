@@ -133,7 +133,7 @@ def _check_png(content: bytes) -> tuple[int, int]:
 
 def _check_jpeg(content: bytes) -> tuple[int, int]:
     """Width and height that a JPEG claims; one that has no end or would take hours is refused."""
-    if b"\xff\xd9" not in content[-1024:]:
+    if content.rfind(b"\xff\xd9") <= content.rfind(b"\xff\xda"):  # cameras pad their files behind the end
         raise BadImage("is truncated: the JPEG has no end")
     if content.count(b"\xff\xda") > MAX_SCANS:
         raise BadImage(f"has more than {MAX_SCANS} passes, no camera's JPEG has")

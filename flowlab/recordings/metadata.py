@@ -80,8 +80,12 @@ class Metadata(FiniteSettings):
     """``.npy`` or ``.csv`` with a row of robot state per color picture, or per time of ``state_times``."""
     state_times: PathInside | None = None
     """File with the time of every row of state [s], on the clock of the pictures."""
+    state_columns: tuple[str, ...] | None = Field(default=None, min_length=1)
+    """Names of the columns of ``state`` to take, in this order; else all that are not times."""
     action: PathInside | None = None
     """Likewise, the actions."""
+    action_columns: tuple[str, ...] | None = Field(default=None, min_length=1)
+    """Names of the columns of ``action`` to take, in this order."""
     action_times: PathInside | None = None
     """File with the time of every row of actions [s]."""
     success: bool = True

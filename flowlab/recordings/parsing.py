@@ -170,6 +170,7 @@ def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
         file, times = getattr(metadata, name), getattr(metadata, f"{name}_times")
         if file is not None:
             where = None if times is None else folder / times
-            samples = load_samples(folder / file, name, where, streams.color.time_s, FILE_NAME)
+            columns = getattr(metadata, f"{name}_columns")
+            samples = load_samples(folder / file, name, where, streams.color.time_s, FILE_NAME, columns)
             changed[name] = (samples,)
     return replace(streams, **changed)

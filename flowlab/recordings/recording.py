@@ -1,5 +1,6 @@
 """Recordings of real robots as demonstrations: found, and opened."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,16 +9,26 @@ from typing import Any
 import numpy as np
 
 from flowlab.errors import DataError, UsageError
-from flowlab.recordings.base import BadImage, Reader, Streams, expected_layouts, load_readers, recognizes
+from flowlab.recordings.base import (
+    BadImage,
+    Reader,
+    Streams,
+    channel_names,
+    expected_layouts,
+    load_readers,
+    recognizes,
+)
 from flowlab.recordings.description import RecordingDescription, StreamInfo, describe
+from flowlab.recordings.folder_files import entries
+from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.frame_check import FrameCheck
 from flowlab.recordings.frame_processing import FrameProcessor
 from flowlab.recordings.parsing import AlignedSamples, ParsedRecording, RecordingSettings, parse_recording
 from flowlab.recordings.sync import find_gaps
 from flowlab.recordings.verdicts import raise_refused
 from flowlab.records import Demonstration, Frame
-from flowlab.text import natural_key
 
+_LOG = logging.getLogger(__name__)
 __all__ = [
     "Recording",
     "RecordingDescription",
@@ -55,7 +66,7 @@ def find_recordings(paths: Sequence[Path], reader: str | None = None) -> list[Pa
     """Every recording at or below some files and folders.
 
     Args:
-        paths: Where to look. Links and hidden files below them are passed over.
+        paths: Where to look. Hidden files below them are passed over; links are followed.
         reader: Import path ``module:Class`` of a reader to ask besides the installed ones; an installed one's name
             changes nothing.
 
@@ -72,22 +83,25 @@ def find_recordings(paths: Sequence[Path], reader: str | None = None) -> list[Pa
             raise UsageError(f"{path}: there is no such file or folder")
         below = list(_below(path, readers))
         if not below:
-            raise UsageError(f"{path}: no recording at or below it; looked for {expected_layouts(readers)}")
+            says = foreign_format(path)
+            raise UsageError(
+                f"{path}: {says}"
+                if says
+                else f"{path}: no recording at or below it; looked for {expected_layouts(readers)}"
+            )
         found.update(dict.fromkeys(below))
     return list(found)
 
 
-def _below(path: Path, readers: tuple[Reader, ...]) -> Iterator[Path]:
-    """The recordings at or below a path."""
+def _below(path: Path, readers: tuple[Reader, ...], above: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """The recordings at or below a path, behind links too; what is known not to be read is told of."""
     if any(recognizes(r, path) for r in readers):
         yield path
-    elif path.is_dir():
-        try:
-            inside = [p for p in path.iterdir() if not p.name.startswith(".") and not p.is_symlink()]
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be looked into ({error.strerror})") from error
-        for p in sorted(inside, key=lambda p: natural_key(p.name)):
-            yield from _below(p, readers)
+    elif says := foreign_format(path):
+        _LOG.warning("flowlab: %s: %s; it is left out", path, says)
+    elif path.is_dir() and (real := path.resolve()) not in above:
+        for name in entries(path):
+            yield from _below(path / name, readers, above | {real})
 
 
 def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: int) -> Recording:
@@ -141,5 +155,7 @@ def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSam
         "origin": dict(sorted(source.origin.items())),
         "world": "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame",
         "action": rows.action_source,
+        "state_names": channel_names(streams.state),
+        "action_names": channel_names(streams.action),
         "checks": [check.to_json() for check in source.checks],
     }

@@ -18,5 +18,13 @@ def load_mujoco() -> None:
             raise
         raise MissingLibraryError(
             f"MuJoCo cannot load OpenGL as MUJOCO_GL={os.environ['MUJOCO_GL']} asks ({error}); unset MUJOCO_GL, or "
-            "install it with 'apt-get install libegl1 libgl1-mesa-dri libosmesa6'"
+            f"{gl_advice(os.environ['MUJOCO_GL'])}"
         ) from error
+
+
+def gl_advice(backend: str) -> str:
+    """What to do where an OpenGL back end of MuJoCo cannot be loaded."""
+    packages = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
+    if backend.lower() == "glfw":
+        return "set MUJOCO_GL=egl: glfw needs a display (DISPLAY) and the package libglfw3"
+    return f"install it with 'apt-get install {packages.get(backend.lower(), 'libegl1 libgl1-mesa-dri libosmesa6')}'"

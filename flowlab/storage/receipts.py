@@ -86,6 +86,8 @@ class Receipt(Settings):
     rejects: tuple[Reject, ...] = ()
     digests: tuple[str, ...]
     """SHA-256 of each of these episodes."""
+    contents: tuple[str, ...] = ()
+    """Identity of the recording of each seed, by its content; empty for simulation, and of an earlier flowlab."""
     shard_sha256: str = ""
     """Of the shard's file; empty where there is none, or where it is a folder, as before schema version 2."""
     rejects_sha256: str = ""

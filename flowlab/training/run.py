@@ -23,17 +23,14 @@ from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (
     POLICY,
     RUN,
-    RunConfig,
     TrainedPolicy,
     build_policy,
     check_observer,
-    has_begun,
     load_policy,
-    read_resume,
-    read_run_config,
     read_trained,
     writing_run,
 )
+from flowlab.policies.run_folder import RunConfig, has_begun, read_resume, read_run_config
 from flowlab.registry import POLICIES, names_from_file
 from flowlab.storage.manifest import differences
 from flowlab.training.distributed import ProcessGroup

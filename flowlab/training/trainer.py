@@ -14,15 +14,8 @@ from flowlab.data.window_sampler import WindowSampler, index_windows
 from flowlab.errors import DataError, FlowlabError
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.checkpoint import (
-    Groups,
-    RunConfig,
-    TrainedPolicy,
-    save_resume,
-    save_weights,
-    start_folder,
-    writing_run,
-)
+from flowlab.policies.checkpoint import TrainedPolicy, save_weights, writing_run
+from flowlab.policies.run_folder import Groups, RunConfig, save_resume, start_folder
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.metrics import MetricsFile, RunningMeans
 from flowlab.training.optimizer import EMA, Optimizers
@@ -165,7 +158,7 @@ class Trainer:
         }
 
     def load_state(self, step: int, groups: Groups) -> None:
-        """Go on from what :func:`~flowlab.policies.checkpoint.read_resume` gives."""
+        """Go on from what :func:`~flowlab.policies.run_folder.read_resume` gives."""
         try:
             self.policy.load_state_dict(groups["policy"])
             self.average.policy.load_state_dict(groups["average"])

@@ -10,6 +10,8 @@ from plugin_packages import environment, install
 from real_recordings import write_folder
 from synthetic import make_dataset, make_episode
 
+from flowlab.storage.dataset import open_dataset
+
 TRACKER = """
 from flowlab.tracking.trackers.lucas_kanade import LucasKanade
 
@@ -121,10 +123,10 @@ def test_recordings_in_a_layout_of_others_are_labeled_by_a_tracker_of_others(
         env=environment(site),
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    extras = next((out / "shards").rglob("zarr.json")).read_text()
-    assert '"reader": "box"' in extras
-    assert '"tracker": "followed"' in extras
-    assert '"window": 15' in extras
+    extras = open_dataset(out)[0].extras
+    assert extras["reader"] == "box"
+    assert '"tracker": "followed"' in json.dumps(extras)
+    assert '"window": 15' in json.dumps(extras)
 
 
 def test_an_exporter_of_others_is_found_and_takes_options(site: Path, tmp_path: Path, flowlab: Cli) -> None:

@@ -175,7 +175,7 @@ def test_a_dry_run_says_what_it_recognizes_and_writes_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     before = files_below(recordings)
-    code, output, _ = call_cli(capsys, "track-real", recordings, "--dry-run", "--json", *SMALL)
+    code, output, _ = call_cli(capsys, "track-real", recordings, "--dry-run", "--estimate", "--json", *SMALL)
     assert code == 0
     plan = json.loads(output)
     assert [(r["task"], Path(r["recording"]).name, r["rows"], r["problem"]) for r in plan["recordings"]] == [
@@ -191,7 +191,7 @@ def test_a_dry_run_says_what_it_recognizes_and_writes_nothing(
     assert plan["frames"] == 60
     assert plan["cpu_ms_per_frame"] > 0
     assert plan["estimate"] == "measured on the first 12 frames of slide/1"
-    code, people, _ = call_cli(capsys, "track-real", recordings, "--dry-run", *SMALL)
+    code, people, _ = call_cli(capsys, "track-real", recordings, "--dry-run", "--estimate", *SMALL)
     for words in (
         "task 'slide', 12 rows, read as a plain recording",
         "12 at 10 per second, no gaps",
@@ -214,7 +214,7 @@ def test_a_dry_run_names_gaps_bad_frames_and_what_is_missing(
     (folder / "times.txt").write_text("\n".join(times[:12] + [str(float(t) + 0.5) for t in times[12:]]))
     described = (folder / "recording.yaml").read_text().splitlines(keepends=True)
     (folder / "recording.yaml").write_text("".join(line for line in described if "intrinsics" not in line))
-    code, output, errors = call_cli(capsys, "track-real", tmp_path, "--dry-run", *SMALL)
+    code, output, errors = call_cli(capsys, "track-real", tmp_path, "--dry-run", "--estimate", *SMALL)
     assert code == 3
     assert "1 of 1 recordings cannot be used as they are" in errors
     assert "1 gaps, the longest of 0.60 s at 1.10 s" in output

@@ -21,7 +21,8 @@ from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
-from flowlab.policies.checkpoint import RunConfig, TrainedPolicy, save_weights, start_folder
+from flowlab.policies.checkpoint import TrainedPolicy, save_weights
+from flowlab.policies.run_folder import RunConfig, start_folder
 from flowlab.records import Frame
 from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
 from flowlab.sim.scene_settings import CameraSettings, SceneSettings
@@ -84,7 +85,7 @@ def trained(folder: Path, settings: SceneSettings) -> Path:
         dataset=folder, steps=1, train=(0,), held_out=(), threads=1, device="cpu", precision="fp32", logs=(),
         began_from=None,
     )  # fmt: skip
-    start_folder(folder, about, run)
+    start_folder(folder, about, run, {})
     save_weights(folder, Picture(spec()), 1)
     return folder
 

@@ -271,7 +271,9 @@ def test_a_topic_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 def test_no_depth_is_said_with_what_there_is(tmp_path: Path) -> None:
     path = write_kind(tmp_path, "mcap", lambda m, say: say_camera(m, say, depth=False))
-    with pytest.raises(DataError, match=r"no topic is known as depth; it has .*/camera/color/image_raw \(sensor_msgs"):
+    with pytest.raises(
+        DataError, match=r"no topic is known as depth; it has .*/camera/color/image_raw \(rgb8 pictures"
+    ):
         opened(path)
 
 

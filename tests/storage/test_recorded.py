@@ -57,13 +57,43 @@ def test_a_moved_recording_is_still_the_same(tmp_path: Path) -> None:
     assert {r.name: r.source for r in moved} == {"a": str(tmp_path / "new/a"), "b": "/rec/pour/b"}
 
 
-def test_two_recordings_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_two_recordings_of_one_name_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
     one, other = recorded("a", source=str(tmp_path)), recorded("a", source="/elsewhere/a")
-    sentence = f"two recordings of the task 'pour' are called 'a': {tmp_path} and /elsewhere/a; rename one"
+    sentence = "two recordings of the task 'pour' are called 'a', which cannot be told apart: .* leave one out, rename"
     with pytest.raises(UsageError, match=sentence):
         number_recordings((), [one, other])
     with pytest.raises(UsageError, match=sentence):
         number_recordings(number_recordings((), [one]), [other])
+    with pytest.raises(UsageError, match="called 'a', with the same content"):
+        number_recordings(number_recordings((), [known_by(one, "x/1")]), [known_by(other, "x/2")])
+
+
+def known_by(one: Recorded, content: str) -> Recorded:
+    return one.model_copy(update={"content": content})
+
+
+def test_one_of_the_same_name_and_other_content_is_a_new_recording(tmp_path: Path) -> None:
+    monday = number_recordings((), [known_by(recorded("0", source="/mon/pour/0"), "m/")])
+    tuesday = known_by(recorded("0", source=str(tmp_path)), "t/")
+    both = number_recordings(monday, [tuesday])
+    assert [(r.name, r.seed, r.source) for r in both] == [("0", 0, "/mon/pour/0"), ("0-2", 1, str(tmp_path))]
+    assert number_recordings(both, [tuesday]) == both
+    third = number_recordings(both, [known_by(recorded("0", source="/wed/pour/0"), "w/")])
+    assert [r.name for r in third] == ["0", "0-2", "0-3"]
+    # All that were archived are known again by their content, wherever they lie.
+    back = [known_by(recorded("x", source=f"/back/{k}"), k) for k in ("w/", "m/")]
+    assert {r.content: r.seed for r in number_recordings(third, back)} == {"m/": 0, "t/": 1, "w/": 2}
+
+
+def test_one_that_changed_where_it_lies_is_the_same_and_one_that_took_its_place_is_not() -> None:
+    known = number_recordings((), [known_by(recorded("0"), "a/1"), known_by(recorded("1"), "b/1")])
+    changed = number_recordings(known, [known_by(recorded("0"), "c/1"), known_by(recorded("1"), "b/2")])
+    assert [(r.name, r.seed, r.content) for r in changed] == [("0", 0, "c/1"), ("1", 1, "b/2")]
+    moved = number_recordings(known, [known_by(recorded("2"), "a/1"), known_by(recorded("0"), "new/1")])
+    assert [(r.source, r.seed, r.content) for r in moved] == [
+        ("/rec/pour/2", 0, "a/1"), ("/rec/pour/1", 1, "b/1"), ("/rec/pour/0", 2, "new/1"),
+    ]  # fmt: skip
+    assert [r.name for r in moved] == ["0", "1", "0-2"]
 
 
 def test_names_may_be_alike_in_different_tasks_and_repeated_paths_count_once() -> None:

@@ -167,7 +167,7 @@ def test_quality_is_that_of_all_positions_together(tmp_path: Path) -> None:
     }
     assert found["quality"]["source_share"] == pytest.approx(shares)
     card = (tmp_path / "README.md").read_text()
-    assert "estimated from pictures, by the tracker `by-hand`" in card
+    assert "estimated from pictures, by the tracker by-hand" in card
     assert f"{shares['measured']:.0%} are measured, {shares['model']:.0%} are model" in card
 
 

@@ -32,8 +32,8 @@ from trained_runs import (
     without_times,
 )
 
-from flowlab.policies.checkpoint import RESUME
 from flowlab.policies.profiles import load_settings
+from flowlab.policies.run_folder import RESUME
 from flowlab.training import run as training_run
 
 Capture = pytest.CaptureFixture[str]

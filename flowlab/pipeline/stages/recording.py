@@ -1,6 +1,7 @@
 """The stages of recordings, with those they share. Each is a thin skin over the function that does the work."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,8 +16,10 @@ from flowlab.pipeline.stages.labeled import labeled
 from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage
 from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
+from flowlab.recordings.identity import difference, identity, wait_until_quiet
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
 from flowlab.records import Clip, Episode, QueriedDemo, Queries, TrackedDemo
+from flowlab.storage.recorded import CONTENT
 from flowlab.tracking.base import make_tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
 from flowlab.tracking.labeling import to_3d
@@ -45,10 +48,21 @@ class RecordingStage(Stage, RecordingSettings):
 
     def process(self, record: EpisodeRequest) -> Recording:
         """Open the recording that the request names."""
+        path = Path(record.source)
         try:
-            return open_recording(Path(record.source), self, task=record.task, seed=record.seed)
+            wait_until_quiet(path)
+            content = identity(path, self)
+            recording = open_recording(path, self, task=record.task, seed=record.seed)
+            changed = difference(content, identity(path, self))
         except DataError as error:
             raise Rejected(str(error), retry=True) from error
+        if changed:
+            raise Rejected(
+                f"{path}: {changed} changed while it was read, so it is still being written; run the same command "
+                "again when it is complete",
+                retry=True,
+            )
+        return replace(recording, extras={**recording.extras, CONTENT: content})
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:
         """Recorded, each in a world frame of its own; what the numbers of state and action mean is not known."""

@@ -24,9 +24,24 @@ NAMES = {
     "action": ("action", "actions"),
     "time": ("time", "time_s", "timestamp", "timestamps"),
     "intrinsics": ("intrinsics", "K"),
+    "pose": (
+        "T_world_cam",
+        "cam2world",
+        "camera_to_world",
+        "camera_pose",
+        "extrinsics",
+        "extrinsic",
+        "T_cam_world",
+        "world2cam",
+        "world_to_camera",
+        "poses",
+        "camera_poses",
+    ),
     "ends": ("episode_ends",),
 }
 """What arrays may be called, by what they are."""
+POSES = ("T_world_cam", "cam2world", "camera_to_world")
+"""Those of poses whose names say that they map the camera to the world."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +90,11 @@ class ArraysReader:
         _check(store, names, color, depth)
         time_s = _times(store, len(color), given)
         K = store.load("intrinsics")
-        known = () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
+        T = None if given.T_world_cam is not None else store.load("pose")
+        known: tuple[tuple[str, Metadata], ...] = (
+            () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
+        )
+        known += () if T is None else ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
             ImageStream(_called(names["color"], len(color)), time_s, partial(_color, store, color)),
             ImageStream(_called(names["depth"], len(depth)), time_s, partial(_depth, store, depth)),
@@ -169,4 +188,23 @@ def _known(path: Path, K: np.ndarray) -> Metadata:
     """The intrinsics that a matrix tells."""
     if K.shape[-2:] != (3, 3) or not K.size or K.dtype.kind not in "iuf":
         raise DataError(f"{path}: the intrinsics are {K.dtype} {cut(str(K.shape))}, expected numbers (3, 3)")
-    return Metadata(intrinsics=Intrinsics.from_matrix(K.reshape(-1, 3, 3)[0].astype(float)))
+    every = K.reshape(-1, 3, 3).astype(float)
+    if not np.allclose(every, every[0], rtol=1e-6, atol=1e-6):
+        raise DataError(
+            f"{path}: the intrinsics change from step to step, expected one camera; write one file for each"
+        )
+    return Metadata(intrinsics=Intrinsics.from_matrix(every[0]))
+
+
+def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
+    """The pose of the camera, where it is the same at every step."""
+    advice = f"give the pose of a camera that stands still as 'T_world_cam' in {FILE_NAME}"
+    if T.shape[-2:] != (4, 4) or not T.size or T.dtype.kind not in "iuf":
+        raise DataError(f"{path}: '{name}' is {T.dtype} {cut(str(T.shape))}, expected numbers (4, 4); {advice}")
+    every = T.reshape(-1, 4, 4).astype(float)
+    if not np.allclose(every, every[0], rtol=0, atol=1e-6):
+        raise DataError(f"{path}: '{name}' changes from step to step: the camera moves, and is read as fixed; {advice}, or "  # noqa: E501
+                        "record one that does")  # fmt: skip
+    if name not in POSES:
+        raise DataError(f"{path}: '{name}' does not say whether it maps camera to world or world to camera; {advice}")
+    return Metadata(T_world_cam=every[0].tolist())

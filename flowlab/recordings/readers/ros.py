@@ -12,6 +12,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.metadata import FILE_NAME, Metadata, Topics
+from flowlab.recordings.readers.joint_states import JointGroup, join_by_name
 from flowlab.recordings.readers.realsense import is_sdk_bag
 from flowlab.recordings.readers.ros_bag import BagIndex, RosBag
 from flowlab.recordings.readers.ros_messages import (
@@ -23,8 +24,9 @@ from flowlab.recordings.readers.ros_messages import (
     message_numbers,
     relative_pose,
 )
+from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import shown
+from flowlab.text import cut, shown
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -50,7 +52,9 @@ class ROSReader:
     def probe(self, path: Path) -> bool:
         """Whether it is a recording of ROS, and none of the RealSense SDK."""
         if path.is_dir():
-            return (path / "metadata.yaml").is_file() and any(f.suffix in (".mcap", ".db3") for f in path.iterdir())
+            return (path / "metadata.yaml").is_file() and any(
+                f.name.endswith((".mcap", ".db3", ".mcap.zstd", ".db3.zstd")) for f in path.iterdir()
+            )
         known = path.suffix in (".mcap", ".db3") or (path.suffix == ".bag" and not is_sdk_bag(path))
         return known and path.is_file()
 
@@ -66,11 +70,16 @@ class ROSReader:
         if not own_clock:
             says = "the messages' stamps are from another clock, so the times of recording are taken"
             checks.append(Check("clock", Verdict.ASSUMED, says))
+        robot: dict[str, tuple[SampleStream, ...]] = {}
+        for what, topic in (("state", topics.state), ("action", topics.action)):
+            robot[what], told = ((), []) if topic is None else streams[topic].samples(what)
+            checks += told
+        checks += _unchosen(bag, topics)
         return Streams(
             streams[topics.color].pictures(),
             streams[topics.depth].pictures(),
-            state=() if topics.state is None else (streams[topics.state].samples("state"),),
-            action=() if topics.action is None else (streams[topics.action].samples("action"),),
+            state=robot["state"],
+            action=robot["action"],
             known=(*known, _unit(bag, topics.depth)),
             registered=registered,
             checks=tuple(checks),
@@ -140,7 +149,8 @@ def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int
         return topics[0]
     where = f"{bag.path.with_suffix('.yaml').name if bag.path.is_file() else FILE_NAME} or the calibration file"
     if not topics:
-        every = ", ".join(f"{t} ({kind})" for t, kind in sorted(bag.types().items())) or "no topic"
+        kinds = bag.types() | {t: f"{bag.encoding(t)} pictures" for t in counts}
+        every = ", ".join(f"{t} ({kind})" for t, kind in sorted(kinds.items())) or "no topic"
         raise DataError(f"{bag.path}: no topic is known as {what}; it has {every}; name one in {where}: "
                         f"'topics: {{{what}: ...}}'")  # fmt: skip
     some = ", ".join(f"{t} ({counts[t]} pictures)" for t in topics)
@@ -241,6 +251,15 @@ def _is_off(index: BagIndex) -> bool:
     return bool(np.isfinite(off).any() and np.nanmedian(off) > CLOCK_ERROR_S)
 
 
+def _unchosen(bag: RosBag, topics: ChosenTopics) -> list[Check]:
+    """A doubt where several topics may be the state, and none of them is taken."""
+    joints = list(bag.topics(JOINTS))
+    if topics.state is not None or not joints:
+        return []
+    says = f"none is taken, for several topics may be it: {cut(', '.join(joints))}; choose one with 'topics: {{state: ...}}'"  # noqa: E501
+    return [Check("state", Verdict.DOUBTFUL, says)]
+
+
 @dataclass(frozen=True, slots=True)
 class _Topic:
     """A topic in the order of time."""
@@ -263,17 +282,51 @@ class _Topic:
         names = tuple(f"{self.name}[{i}]" for i in order)
         return ImageStream(names, self.times()[order], partial(_picture, self, order))
 
-    def samples(self, what: str) -> SampleStream:
-        """Its messages as rows of numbers."""
-        rows = [message_numbers(message) for _, message in self.bag.messages(self.name)]
-        widths = sorted({len(row) for row in rows})
-        if len(widths) != 1 or not widths[0]:
-            raise DataError(
-                f"{self.bag.path}: the messages of {self.name} hold {' or '.join(map(str, widths))} numbers, expected "
-                f"the same number of each; choose another topic, or none, with 'topics: {{{what}: ...}}'"
-            )
-        order = np.argsort(self.times(), kind="stable")
-        return SampleStream(what, self.times()[order], np.array(rows, np.float32)[order])
+    def samples(self, what: str) -> tuple[tuple[SampleStream, ...], list[Check]]:
+        """Its messages as rows of numbers, and what is to be said of them; joints by their names."""
+        messages = [message for _, message in self.bag.messages(self.name)]
+        place = f"{self.bag.path}: {self.name}"
+        if self.bag.types()[self.name] == JOINTS and any(len(m.position) for m in messages):
+            groups, checks = join_by_name(place, messages)
+            _check_unnamed(place, what, groups)
+        else:
+            groups, checks = [_unnamed(place, what, messages)], []
+        streams = []
+        for k, group in enumerate(groups):
+            time_s = self.times()[group.messages]
+            order = np.argsort(time_s, kind="stable")
+            name = what if k == 0 else f"{what} {k + 1}"
+            streams.append(SampleStream(name, time_s[order], group.positions[order], columns=group.names))
+        return tuple(streams), checks
+
+
+def _unnamed(place: str, what: str, messages: Sequence[Any]) -> JointGroup:
+    """Numbers that have no names, in their order in the messages; those that are not finite are left out."""
+    rows = [message_numbers(message) for message in messages]
+    widths = sorted({len(row) for row in rows})
+    if len(widths) != 1 or not widths[0]:
+        raise DataError(
+            f"{place}: the messages hold {' or '.join(map(str, widths))} numbers, expected the same number of each; "
+            f"choose another topic, or none, with 'topics: {{{what}: ...}}'"
+        )
+    values = to_float32(np.array(rows, np.float64))
+    whole = np.isfinite(values).all(1)
+    if not whole.all():
+        raise DataError(
+            f"{place}: {(~whole).sum()} of {len(whole)} messages hold what is no number; choose another topic, or none, "  # noqa: E501
+            f"with 'topics: {{{what}: ...}}'"
+        )
+    return JointGroup((), np.flatnonzero(whole), values)
+
+
+def _check_unnamed(place: str, what: str, groups: Sequence[JointGroup]) -> None:
+    """Refuse joints without names beside others: nothing tells which they are."""
+    if len(groups) > 1 and not all(g.names for g in groups):
+        widths = " or ".join(str(g.positions.shape[1]) for g in groups)
+        raise DataError(
+            f"{place}: the messages hold {widths} numbers, and not all name their joints, expected the same number of "
+            f"each; choose another topic, or none, with 'topics: {{{what}: ...}}'"
+        )
 
 
 def _picture(topic: _Topic, order: np.ndarray, i: int) -> np.ndarray:

@@ -75,6 +75,11 @@ class RosBag:
             raise DataError(f"{self.path}: the topic {topic} holds no messages; choose another with 'topics'")
         return message
 
+    def encoding(self, topic: str) -> str:
+        """How the pictures of a topic are encoded."""
+        message = self.first(topic)
+        return cut(str(getattr(message, "encoding", getattr(message, "format", ""))))
+
     def messages(
         self, topic: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[int, Any]]:

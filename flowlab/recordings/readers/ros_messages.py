@@ -54,7 +54,7 @@ def decode_image(message: Any) -> np.ndarray:
         return _decode_compressed(message)
     encoding = message.encoding
     if encoding not in _CHANNELS:
-        raise BadImage(f"has the encoding {shown(encoding)}, which is not read")
+        raise BadImage(f"has the encoding {shown(encoding)}, which is not read; convert it to rgb8 (image_proc does)")
     dtype, channels = _CHANNELS[encoding]
     row = message.width * channels * np.dtype(dtype).itemsize
     data = np.asarray(message.data, np.uint8)
@@ -73,6 +73,8 @@ def decode_image(message: Any) -> np.ndarray:
 def _decode_compressed(message: Any) -> np.ndarray:
     """RGB or depth counts of a CompressedImage."""
     content = np.asarray(message.data, np.uint8).tobytes()
+    if "rvl" in message.format.lower():
+        raise BadImage("is depth compressed as RVL, which is not read; record the raw topic, or with format 'png'")
     if not is_depth(message):
         return decode_color(content)
     if message.format.startswith("32FC1"):

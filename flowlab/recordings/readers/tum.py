@@ -50,6 +50,8 @@ class TUMReader:
             if file is None:
                 raise DataError(f"{path}: has neither rgb.txt and depth.txt nor {ASSOCIATIONS[0]}")
             pairs = _entries(file, 4)
+            if pairs and "depth" in pairs[0][1].lower() and "depth" not in pairs[0][3].lower():  # as ICL-NUIM has it
+                pairs = sorted(((*p[2:], *p[:2]) for p in pairs), key=lambda p: float(p[0]))
             color, depth = [p[:2] for p in pairs], sorted(((p[2], p[3]) for p in pairs), key=lambda p: float(p[0]))
         known = [("the custom of TUM RGB-D", Metadata(depth_unit_m=1 / DEPTH_FACTOR))]
         camera = next((name for name in KINECTS if name in path.resolve().name), None)

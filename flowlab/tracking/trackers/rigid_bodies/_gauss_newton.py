@@ -29,13 +29,24 @@ def align(points, lightness, R, t, lightness_picture, smooth, normal, K, iterati
             step = _damped_step(*_normal_equations(X[:m], gray[:m], center, smooth, normal, K), m)
             turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
             if turn > 0.1:
-                step *= 0.1 / turn
-            dR = _rotation(step[:3])
-            t[b] = dR @ (t[b] - center) + center + step[3:]
-            R[b] = dR @ R[b]
-            if turn < 2e-4 and np.sqrt((step[3:] ** 2).sum()) < 5e-5:
+                for a in range(6):
+                    step[a] *= 0.1 / turn
+            _move(R[b], t[b], step, center)
+            if turn < 2e-4 and np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2) < 5e-5:
                 break
     return R, t
+
+
+@numba.njit(cache=True)
+def _move(R, t, step, center) -> None:
+    """Turn a pose about the center and shift it, in place: number by number, which compiles in a fifth of the time."""
+    dR, old_R, old_t = _rotation(step), R.copy(), t.copy()
+    for i in range(3):
+        t[i] = center[i] + step[3 + i]
+        for k in range(3):
+            t[i] += dR[i, k] * (old_t[k] - center[k])
+        for j in range(3):
+            R[i, j] = dR[i, 0] * old_R[0, j] + dR[i, 1] * old_R[1, j] + dR[i, 2] * old_R[2, j]
 
 
 @numba.njit(cache=True)
@@ -60,11 +71,14 @@ def _compare(points, lightness, R, t, lightness_picture, smooth, K, X, gray) -> 
         d = smooth[int(v + 0.5), int(u + 0.5)]
         if d == 0 or abs(d - z) > 0.02 * max(1.0, z * z):
             continue
-        center += X[m]
+        for a in range(3):
+            center[a] += X[m, a]
         value, gray[m, 1], gray[m, 2] = _value_and_gradient(lightness_picture, u, v)
         gray[m, 0] = value - lightness[k]
         m += 1
-    return m, center / max(m, 1)
+    for a in range(3):
+        center[a] /= max(m, 1)
+    return m, center
 
 
 @numba.njit(cache=True, inline="always")
@@ -116,7 +130,29 @@ def _damped_step(H, g, spread, m) -> np.ndarray:
     for a in range(3):
         H[a, a] += m * 0.001 * (extent / _DEPTH_SCALE) ** 2 + 1
         H[3 + a, 3 + a] += m * 0.002 / _DEPTH_SCALE**2 + 1
-    return -np.linalg.solve(H, g)
+    return _solve(H, -g)
+
+
+@numba.njit(cache=True)
+def _solve(H, g) -> np.ndarray:
+    """The x of H x = g for a positive definite H (n, n), by Cholesky: ``np.linalg.solve`` takes 11 s to compile."""
+    n = len(g)
+    L, x = np.zeros((n, n)), g.copy()
+    for i in range(n):
+        for j in range(i + 1):
+            rest = H[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(rest) if i == j else rest / L[j, j]
+    for i in range(n):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+        x[i] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= L[k, i] * x[k]
+        x[i] /= L[i, i]
+    return x
 
 
 @numba.njit(cache=True, inline="always")
@@ -131,7 +167,7 @@ def _accumulate(H, g, rx, ry, rz, jx, jy, jz, r, w) -> None:
 
 @numba.njit(cache=True)
 def _rotation(w) -> np.ndarray:
-    """The rotation (3, 3) by a rotation vector."""
+    """The rotation (3, 3) by a rotation vector, the first three numbers."""
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2) + 1e-12
     x, y, z = w[0] / angle, w[1] / angle, w[2] / angle
     s, c = np.sin(angle), 1 - np.cos(angle)

@@ -70,7 +70,8 @@ def aggregate(cost, wanted, valid, depth, feature, reach, depth_scale, color_sca
             if not valid[i, j]:
                 continue
             if not wanted[i, j]:
-                out[:, i, j] = cost[:, i, j]
+                for b in range(bodies):  # a slice would take 8 s to compile, for its message where shapes differ
+                    out[b, i, j] = cost[b, i, j]
                 continue
             total = np.zeros(bodies)
             weights = 0.0

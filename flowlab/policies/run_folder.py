@@ -1,0 +1,115 @@
+"""The folder of a training run: how the run goes, and what resuming needs, beside the policy and its weights."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Tensor
+
+from flowlab.checksums import with_checksum
+from flowlab.config import Settings
+from flowlab.errors import DataError, UsageError
+from flowlab.files import remove_leftovers, write_json
+from flowlab.policies.checkpoint import (
+    CHECKPOINTS,
+    FREE,
+    POLICY,
+    RUN,
+    TrainedPolicy,
+    identity,
+    identity_in,
+    read_run_tensors,
+    validated,
+    writing_run,
+)
+from flowlab.policies.tensor_files import write_tensors
+
+RESUME = "resume.safetensors"
+Groups = Mapping[str, Mapping[str, Tensor]]
+"""Tensors by group and name."""
+
+
+class RunConfig(Settings):
+    """``run.json``: how a run goes; written when it begins, it stays the same until it ends."""
+
+    dataset: Path
+    steps: int
+    train: tuple[int, ...]
+    """Episodes trained on, by their position in the :class:`~flowlab.data.replay_buffer.ReplayBuffer`."""
+    held_out: tuple[int, ...]
+    """Episodes to validate on."""
+    threads: int
+    device: str
+    precision: str
+    logs: tuple[str, ...]
+    began_from: str | None
+    """Checkpoint that the first weights are from."""
+    overfit: int | None = None
+    """How many demonstrations are trained on and validated on, where they are the same."""
+
+
+def read_run_config(folder: Path) -> RunConfig:
+    """``run.json`` of a run."""
+    path = folder / RUN
+    if not path.exists():
+        raise DataError(f"{folder}: no run to resume (it has no {RUN}); start one with 'flowlab train DATASET --out'")
+    return validated(RunConfig, path, FREE)
+
+
+def save_resume(folder: Path, step: int, groups: Groups) -> None:
+    """Keep everything that goes on changing: named groups of tensors, as they are after ``step`` steps."""
+    with writing_run(folder):
+        _write_resume(folder, step, groups, identity_in(folder / POLICY), identity_in(folder / RUN))
+
+
+def read_resume(folder: Path) -> tuple[int, Groups]:
+    """The step, and the groups of :func:`save_resume`."""
+    path = folder / RESUME
+    if not path.exists():
+        raise DataError(f"{folder}: nothing to resume (it has no {RESUME}); start anew, into another --out")
+    tensors, step = read_run_tensors(path, folder, f"start anew; --from {folder} begins with its newest weights")
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        group, _, rest = name.partition(":")
+        groups.setdefault(group, {})[rest] = value
+    return step, groups
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a folder holds a run that can go on, or has come to its end; not what a kill left of a beginning."""
+    kept = (folder / RESUME).exists() or any((folder / CHECKPOINTS).glob("step-*.safetensors"))
+    return kept and (folder / POLICY).exists()
+
+
+def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig, groups: Groups) -> None:
+    """Make a new run of a folder: one that can be resumed, as soon as the last of its files is there.
+
+    Args:
+        folder: Where; what a kill left of an earlier beginning is replaced.
+        trained: What the policy is.
+        run: How the run goes.
+        groups: What goes on changing, as it is before the first step.
+
+    Raises:
+        UsageError: There is a run already.
+    """
+    if has_begun(folder):
+        raise UsageError(
+            f"{folder}: holds a run already; go on with 'flowlab train {folder} --resume', or choose another --out"
+        )
+    if any((folder / CHECKPOINTS).glob("step-*")):
+        raise UsageError(f"{folder}: holds checkpoints, but no {POLICY} that says of what; choose another --out")
+    about = with_checksum(json.loads(trained.model_dump_json()))
+    plan = with_checksum(json.loads(run.model_dump_json()), FREE)
+    with writing_run(folder, "nothing was begun. Make room, then give the same command again, or choose another --out"):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(folder)
+        (folder / POLICY).unlink(missing_ok=True)
+        _write_resume(folder, 0, groups, identity(about), identity(plan))
+        write_json(folder / RUN, plan)
+        write_json(folder / POLICY, about)
+
+
+def _write_resume(folder: Path, step: int, groups: Groups, policy: str, run: str) -> None:
+    tensors = {f"{group}:{name}": value for group, values in groups.items() for name, value in values.items()}
+    write_tensors(folder / RESUME, tensors, {"step": step, "policy": policy, "run": run})

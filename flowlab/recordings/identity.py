@@ -1,0 +1,106 @@
+"""What a recording is known by: its content, wherever it lies and whatever it is called.
+
+The identity is a text of two parts with a ``/`` between them: a digest of the files of the recording, and a digest of
+what is said of it (``recording.yaml`` and the calibration file as they are understood, and the reader). Small files are
+digested whole, of larger ones parts that are evenly spread: no two pictures of a sensor have the same noise, and those
+that are compressed end in a checksum. Times of files are not part of it, for copies have others.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from flowlab.errors import DataError
+from flowlab.recordings.base import choose_reader
+from flowlab.recordings.folder_files import FoundFile, files_below
+from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.parsing import RecordingSettings, known_beforehand
+
+_PART = 4096
+"""Bytes of each part of a large file."""
+_WHOLE = {True: 1 << 15, False: 1 << 22}
+"""Bytes up to which a file is digested whole, by whether it is a picture."""
+_PARTS = 64
+"""Most parts of a file; a picture has three."""
+_QUIET = 5
+"""A recording is being written until this many times the usual pause between its last files has passed."""
+_QUIET_S = (0.2, 3.0)
+"""At least and at most so long [s]."""
+
+
+def identity(path: Path, settings: RecordingSettings) -> str:
+    """What a recording is known by.
+
+    Args:
+        path: The recording, a folder or a file.
+        settings: How it is read; of these only the reader and the content of the calibration file count.
+
+    Returns:
+        A text of two digests: of its files, and of what is said of it.
+
+    Raises:
+        DataError: A file of it cannot be read.
+    """
+    return f"{_digest_files(path)}/{_digest_said(path, settings)}"
+
+
+def difference(old: str, new: str) -> str:
+    """In what two identities of a recording differ, in words."""
+    (files, said), (files_now, said_now) = (text.partition("/")[::2] for text in (old, new))
+    parts = ["its files"] * (files != files_now) + [f"{FILE_NAME} or its calibration"] * (said != said_now)
+    return " and ".join(parts)
+
+
+def wait_until_quiet(path: Path) -> None:
+    """Return when nothing has been written into a recording for a while, or when it is clear that this lasts.
+
+    Args:
+        path: The recording.
+    """
+    times = sorted(f.changed_s for f in files_below(path))[-5:]
+    if not times:
+        return
+    pauses = [b - a for a, b in pairwise(times)] or [0.0]
+    quiet = min(max(_QUIET * max(pauses), _QUIET_S[0]), _QUIET_S[1])
+    age = max(time.time() - times[-1], 0.0)  # of a server whose clock is ahead: as if it were from now
+    if age < quiet:
+        time.sleep(quiet - age)
+
+
+def _digest_files(path: Path) -> str:
+    """Of every file but those that say something of the recording, which count as they are understood."""
+    digest = hashlib.blake2b(digest_size=16)
+    for file in files_below(path):
+        if file.name == FILE_NAME:
+            continue
+        digest.update(f"{file.name if path.is_dir() else file.path.suffix}\0{file.size}\0".encode("utf-8", "replace"))
+        for part in _parts(file):
+            digest.update(part)
+    return digest.hexdigest()
+
+
+def _parts(file: FoundFile) -> Iterator[bytes]:
+    """What of a file is digested."""
+    picture = file.path.suffix.lower() in {*COLOR_SUFFIXES, *DEPTH_SUFFIXES} - {".npy", ".npz"}
+    try:
+        with file.path.open("rb", buffering=0) as opened:
+            if file.size <= _WHOLE[picture]:
+                yield opened.read()
+                return
+            count = 3 if picture else _PARTS
+            for k in range(count):
+                opened.seek((file.size - _PART) * k // (count - 1))
+                yield opened.read(_PART)
+    except OSError as error:
+        raise DataError(f"{file.path}: cannot be read ({error.strerror or error})") from error
+
+
+def _digest_said(path: Path, settings: RecordingSettings) -> str:
+    """Of what the user says of a recording, but for its task, by which the dataset knows it anyway."""
+    said = known_beforehand(path, settings).model_dump(mode="json", exclude_defaults=True, exclude={"task"})
+    text = json.dumps([choose_reader(path, settings.reader).name, said], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
