@@ -1,17 +1,25 @@
 """Which numbers of state and action are positions in the world, so that scenes can be moved and given relatively."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from flowlab.config import Settings
-from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError
 from flowlab.provenance import Channels
 
+_LOG = logging.getLogger(__name__)
 _NEAR_M = 0.1
-"""The gripper is taken to be where the state says if, in the median, a point of the cloud is this near."""
+"""Tracks that may show that the gripper is where the state says are this near."""
+_MOTION_M = 0.03
+"""The gripper has moved when it has moved this far."""
+_FOLLOWS = 0.25
+"""A point moves with the gripper where it moves, and stays as far from it up to this share of the way."""
+_PROOFS = 3
+"""So many motions, and half of those with a track nearby, must have points that move with the gripper."""
 _REACHED_M = 0.02
 """Actions are taken to be positions if, in the median, the gripper is this near to them a step later."""
 Triple = tuple[int, int, int]
@@ -52,7 +60,11 @@ def infer_channels(source: TrainingSource, buffer: ReplayBuffer) -> ChannelSpec:
                     f"{source.path}: its provenance names a number of the {name} that is not there; each has {width}"
                 )
         return _as_stated(about.state or (), about.action or ())
-    if about.kind != "recorded" or buffer.state.shape[1] < 3 or not _gripper_is_seen(buffer):
+    if about.kind != "recorded" or buffer.state.shape[1] < 3:
+        return ChannelSpec()
+    if not _gripper_is_seen(buffer):
+        _LOG.info("flowlab: %s: no tracks move with the first three numbers of the state, so they are not taken as the "
+                  "gripper's position; clouds and actions stay in the world", source.path)  # fmt: skip
         return ChannelSpec()
     first = (0, 1, 2)
     to_positions = buffer.action.shape[1] >= 3 and _actions_are_positions(buffer)
@@ -82,9 +94,26 @@ def _triples(channels: Sequence[Channels], kind: str, units: tuple[str, ...] | N
 
 
 def _gripper_is_seen(buffer: ReplayBuffer) -> bool:
-    rows = np.linspace(0, len(buffer.state) - 1, min(len(buffer.state), 200)).astype(int)
-    nearest = [np.linalg.norm(buffer.point_cloud[r] - buffer.state[r, :3], axis=1).min() for r in rows]
-    return bool(np.median(nearest) < _NEAR_M)
+    """Whether what is near the first three numbers of the state moves with them: nearness alone may be chance."""
+    moved = [with_it for e in buffer.episodes for with_it in _motions(buffer, e)]
+    return len(moved) >= _PROOFS and sum(moved) >= max(_PROOFS, len(moved) / 2)
+
+
+def _motions(buffer: ReplayBuffer, episode: EpisodeSlice) -> Iterator[bool]:
+    """For every motion of the gripper with tracks nearby, whether most of those that move do so as it does."""
+    last = episode.start
+    for t in range(episode.start + 1, episode.stop):
+        way = buffer.state[t, :3] - buffer.state[last, :3]
+        length = float(np.linalg.norm(way))
+        if length < _MOTION_M:
+            continue
+        then, now = buffer.tracks[last], buffer.tracks[t]
+        before, after = (np.linalg.norm(p - buffer.state[k, :3], axis=1) for p, k in ((then, last), (now, t)))
+        near = buffer.visible[last] & buffer.visible[t] & (before < _NEAR_M)
+        moves = near & (np.linalg.norm(now - then, axis=1) > _FOLLOWS * length)
+        if near.any():  # held things turn with the gripper, so that their distance stays, not their place beside it
+            yield bool(moves.any() and np.median(np.abs(after - before)[moves]) < _FOLLOWS * length)
+        last = t
 
 
 def _actions_are_positions(buffer: ReplayBuffer) -> bool:

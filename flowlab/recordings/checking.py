@@ -3,8 +3,13 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from flowlab.recordings.camera_check import check_camera
+from flowlab.recordings.depth_unit_check import check_depth_unit
 from flowlab.recordings.left_out import check_widths_known, find_left_out
-from flowlab.recordings.verdicts import Check, Verdict
+from flowlab.recordings.motion_check import check_motion
+from flowlab.recordings.registration_check import check_registration
+from flowlab.recordings.verdicts import Check
+from flowlab.recordings.world_check import check_world
 
 if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
@@ -12,16 +17,23 @@ if TYPE_CHECKING:
 
 def check_recording(source: "ParsedRecording") -> Iterator[Check]:
     """What is looked at in a recording whose layout is understood, and what came of it."""
-    yield _registration(source)
+    yield from _geometry(source)
     yield from check_widths_known(source)
     yield from find_left_out(source)
 
 
-def _registration(source: "ParsedRecording") -> Check:
-    """Whether depth is seen from the color camera, and how that is known."""
-    known = source.metadata
-    if known.depth_intrinsics is not None or known.T_color_depth is not None or source.streams.registered is False:
-        return Check("registration", Verdict.OK, "depth is registered to color by flowlab")
-    if source.streams.registered:
-        return Check("registration", Verdict.OK, "depth is registered to color, as the layout says")
-    return Check("registration", Verdict.ASSUMED, "depth is taken as registered to color: same size, nothing said")
+def _geometry(source: "ParsedRecording") -> Iterator[Check]:
+    """Cameras, depth, and where the camera stands; nothing of what is not known, or not seen."""
+    seen, known = source.frame_check, source.metadata
+    if not seen.samples:
+        return
+    for about, camera, size in (
+        ("intrinsics", known.intrinsics, seen.color_size),
+        ("depth_intrinsics", known.depth_intrinsics, seen.depth_size),
+    ):
+        if camera is not None:
+            yield from check_camera(about, camera, size, source.write_to)
+    yield from check_depth_unit(source)
+    yield check_registration(source)
+    yield from check_world(source)
+    yield check_motion(source)

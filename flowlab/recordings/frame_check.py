@@ -1,8 +1,8 @@
 """The first pass over a recording: which frames make rows, and which are bad, by name and reason."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -10,6 +10,7 @@ from jaxtyping import Float64, Int64
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, find_repeats
 from flowlab.recordings.frame_processing import Size
+from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.sync import nearest_sample, sampling_rate
 from flowlab.recordings.verdicts import Check
 
@@ -45,6 +46,8 @@ class FrameCheck:
     """How far from each color frame its depth and its state are, bad ones included."""
     checks: tuple[Check, ...] = ()
     """What was looked at in the pictures, and what came of it."""
+    samples: tuple[PictureSample, ...] = ()
+    """Small pictures of some rows, evenly spaced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +60,8 @@ class _ImageCheck:
     median: float = 0.0
     digest: PictureDigest | None = None
     """Where it could be decoded."""
+    kept: tuple[np.ndarray, int] | None = None
+    """The picture shrunk, and by how much, where it is one of those to keep."""
 
 
 def check_frames(
@@ -75,8 +80,13 @@ def check_frames(
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
-    color = {int(i): _look(streams.color, int(i), _look_at_color) for i in frames}
-    depth = {int(i): _look(streams.depth, int(i), _look_at_depth) for i in np.unique(match[off <= max_sync_s])}
+    kept = sorted(chosen(len(frames)))
+    keep_color, keep_depth = set(frames[kept].tolist()), set(match[kept].tolist())
+    color = {int(i): _look(streams.color, int(i), _look_at_color, int(i) in keep_color) for i in frames}
+    depth = {
+        int(i): _look(streams.depth, int(i), _look_at_depth, int(i) in keep_depth)
+        for i in np.unique(match[off <= max_sync_s])
+    }
     color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
     good, bad, last = [], [], -np.inf
     for k, (i, j) in enumerate(zip(frames.tolist(), match.tolist(), strict=True)):
@@ -99,7 +109,10 @@ def check_frames(
     rows = np.delete(rows, list(frozen), axis=0)
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
-    return FrameCheck(rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, (repeats,))
+    samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
+    return FrameCheck(
+        rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, (repeats,), samples
+    )
 
 
 def _find_frozen(
@@ -111,16 +124,33 @@ def _find_frozen(
     return find_repeats(streams, digests[0], digests[1], rows, state)
 
 
+def _samples(
+    rows: list[tuple[int, int]], color: Mapping[int, _ImageCheck], depth: Mapping[int, _ImageCheck]
+) -> Iterator[PictureSample]:
+    """The rows of which both pictures were kept."""
+    for row, (i, j) in enumerate(rows):
+        gray, counts = color[i].kept, depth[j].kept
+        if gray is not None and counts is not None:
+            yield PictureSample(row, gray[0], counts[0], gray[1], counts[1])
+
+
 def _selected(color: ImageStream, every: int, start_s: float, stop_s: float | None) -> Int64[np.ndarray, "F"]:
     """Indices of the color pictures that are asked for."""
     since = color.time_s - color.time_s[0]
     return np.flatnonzero((since >= start_s) & (since <= (np.inf if stop_s is None else stop_s)))[::every]
 
 
-def _look(stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageCheck]) -> _ImageCheck:
-    """Decode one picture and judge it."""
+def _look(
+    stream: ImageStream, index: int, judge: Callable[[np.ndarray], _ImageCheck], keep: bool = False
+) -> _ImageCheck:
+    """Decode one picture and judge it; kept is one that is good."""
     try:
-        return judge(stream.read(index))
+        picture = stream.read(index)
+        found = judge(picture)
+        if not keep or found.reason:
+            return found
+        small = small_gray(picture) if picture.ndim == 3 else small_depth(picture)
+        return replace(found, kept=(small, shrink_factor(picture)))
     except BadImage as error:
         return _ImageCheck((0, 0), str(error))
 

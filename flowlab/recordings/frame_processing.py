@@ -10,13 +10,16 @@ from jaxtyping import Float, Float32, Num, UInt8
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.limits import MAX_DEPTH_PIXELS
-from flowlab.recordings.metadata import Intrinsics, Metadata
+from flowlab.recordings.camera_check import check_camera
+from flowlab.recordings.depth_unit_check import likely_unit
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.lens import undistortion_maps
+from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.registration import Registration
+from flowlab.recordings.verdicts import Verdict
 
 Size = tuple[int, int]
 """Width and height [px]."""
-PLAUSIBLE_M = (0.02, 100.0)
-"""The median depth of a picture lies between these, or its unit is wrong [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +99,9 @@ def make_frame_processor(
     factor = -(-color[0] // max_width)
     size = color[0] // factor, color[1] // factor
     T_world_cam = np.eye(4) if metadata.T_world_cam is None else np.array(metadata.T_world_cam)
-    maps = None
-    if intrinsics.is_distorted:
-        maps = cv2.initUndistortRectifyMap(K, np.array(intrinsics.distortion), np.eye(3), K, color, cv2.CV_32FC1)
-    shrunk = Camera(*size, shrink_intrinsics(K, factor), T_world_cam)
-    return FrameProcessor(shrunk, unit, factor, maps, registration)
+    lens = intrinsics.lens
+    maps = None if lens is None else undistortion_maps(lens, K, intrinsics.distortion, color)
+    return FrameProcessor(Camera(*size, shrink_intrinsics(K, factor), T_world_cam), unit, factor, maps, registration)
 
 
 def shrink_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
@@ -122,51 +123,19 @@ def _intrinsics(path: Path, metadata: Metadata, size: Size, write_to: str) -> In
             f"{path}: the intrinsics of the color camera are not known; write into {write_to}: "
             f"'intrinsics: {{width: {size[0]}, height: {size[1]}, fx: ..., fy: ..., cx: ..., cy: ...}}'"
         )
-    of = (given.width or size[0], given.height or size[1])
-    scaled = _scaled(given, of, size).to_yaml()
-    if of != size:
-        raise DataError(
-            f"{path}: the intrinsics are for pictures of {of[0]}x{of[1]}, but these have {size[0]}x{size[1]}; "
-            f"if they were shrunk as a whole, write into {write_to}: 'intrinsics: {scaled}'"
-        )
-    if given.width is None and not (0.2 < given.cx / size[0] < 0.8 and 0.2 < given.cy / size[1] < 0.8):
-        raise DataError(
-            f"{path}: the principal point ({given.cx:g}, {given.cy:g}) is far from the middle of pictures of "
-            f"{size[0]}x{size[1]}, so the intrinsics may be for another size; write into {write_to} those of these "
-            f"pictures, with their size: 'intrinsics: {scaled}'"
-        )
+    refused = [c.says for c in check_camera("intrinsics", given, size, write_to) if c.verdict is Verdict.REFUSED]
+    if refused:
+        raise DataError(f"{path}: {'; '.join(refused)}")
     return given
-
-
-def _scaled(given: Intrinsics, of: Size, size: Size) -> Intrinsics:
-    """Intrinsics of the same pictures in another size."""
-    x, y = size[0] / of[0], size[1] / of[1]
-    return given.model_copy(
-        update={
-            "width": size[0],
-            "height": size[1],
-            "fx": round(given.fx * x, 6),
-            "fy": round(given.fy * y, 6),
-            "cx": round((given.cx + 0.5) * x - 0.5, 6),
-            "cy": round((given.cy + 0.5) * y - 0.5, 6),
-        }
-    )
 
 
 def _unit(path: Path, metadata: Metadata, median_counts: float, write_to: str) -> float:
     """The unit of depth, where it makes a scene of plausible size."""
     unit = metadata.depth_unit_m
-    likely = next((u for u in (1.0, 0.001, 0.0001) if PLAUSIBLE_M[0] < median_counts * u < 20), 0.001)
-    hint = f"'depth_unit_m: {likely}' would make that {median_counts * likely:.3g} m"
     if unit is None:
         raise DataError(
             f"{path}: the unit of depth is not known; the median reading is {median_counts:g} counts: write into "
-            f"{write_to} what one count is in meters ({hint})"
-        )
-    if not PLAUSIBLE_M[0] < median_counts * unit < PLAUSIBLE_M[1]:
-        raise DataError(
-            f"{path}: with depth_unit_m {unit:g} the median reading of {median_counts:g} counts is "
-            f"{median_counts * unit:.3g} m, which cannot be; correct it in {write_to} ({hint})"
+            f"{write_to} what one count is in meters ({likely_unit(median_counts)})"
         )
     return unit
 
@@ -191,12 +160,11 @@ def _registration(
             f"{path}: depth ({depth[0]}x{depth[1]}) {why} ({color[0]}x{color[1]}); to have it registered, write "
             f"into {write_to} {' and '.join(lines)} (the pose of the depth camera in the color camera, meters)"
         )
-    of = (camera.width or depth[0], camera.height or depth[1])
-    if of != depth:
-        raise DataError(
-            f"{path}: depth_intrinsics are for pictures of {of[0]}x{of[1]}, but these have {depth[0]}x{depth[1]}; "
-            f"correct them in {write_to}"
-        )
+    refused = [
+        c.says for c in check_camera("depth_intrinsics", camera, depth, write_to) if c.verdict is Verdict.REFUSED
+    ]
+    if refused:
+        raise DataError(f"{path}: {'; '.join(refused)}")
     if depth[0] * depth[1] > MAX_DEPTH_PIXELS:
         raise DataError(
             f"{path}: depth pictures of {depth[0]}x{depth[1]} pixels cannot be registered, expected at most "

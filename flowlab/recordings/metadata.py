@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Num
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
-from flowlab.config import Settings, SettingsError
+from flowlab.config import Settings
 from flowlab.errors import DataError, unknown_name
+from flowlab.recordings.intrinsics import FiniteSettings, Intrinsics
 from flowlab.recordings.stamps import Unit
 from flowlab.text import cut, is_path_inside, shown
 from flowlab.untrusted import read_yaml
@@ -24,13 +24,6 @@ def _inside(name: str) -> str:
     if not is_path_inside(name):
         raise ValueError("must name a file in the recording's folder, without '..' or a '/' at its start")
     return name
-
-
-def _coefficients(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Refuse numbers of coefficients that no model has."""
-    if len(values) not in (0, 4, 5, 8, 12, 14):
-        raise ValueError(f"has {len(values)} coefficients, expected 4, 5, 8, 12 or 14, in OpenCV's order")
-    return values
 
 
 def check_rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
@@ -50,60 +43,6 @@ PathInside = Annotated[str, AfterValidator(_inside)]
 Rigid = Annotated[tuple[Row, Row, Row, Row], AfterValidator(check_rigid)]
 
 
-class _FiniteSettings(Settings):
-    """Settings whose numbers are finite."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Intrinsics(_FiniteSettings):
-    """A pinhole camera, pixel centers at integer coordinates."""
-
-    fx: float = Field(gt=0)
-    """[px]"""
-    fy: float = Field(gt=0)
-    """[px]"""
-    cx: float
-    """[px]"""
-    cy: float
-    """[px]"""
-    width: int | None = Field(default=None, gt=0)
-    """Of the pictures that the numbers belong to [px]."""
-    height: int | None = Field(default=None, gt=0)
-    """[px]"""
-    distortion: Annotated[tuple[float, ...], AfterValidator(_coefficients)] = ()
-    """OpenCV's coefficients k1, k2, p1, p2, k3, ...; the pictures are undistorted where there are any."""
-
-    @property
-    def K(self) -> np.ndarray:
-        """The matrix (3, 3) [px]."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], float)
-
-    @property
-    def is_distorted(self) -> bool:
-        """Whether the pictures must be undistorted."""
-        return any(self.distortion)
-
-    @classmethod
-    def from_matrix(cls, K: Num[np.ndarray, "3 _"], **others: Any) -> "Intrinsics":
-        """From a matrix (3, 3) or (3, 4) [px]."""
-        K = np.asarray(K, float)
-        if K.ndim != 2 or K.shape[0] != 3 or K.shape[1] not in (3, 4):
-            raise SettingsError(f"the matrix of intrinsics has the shape {K.shape}, expected (3, 3) or (3, 4)")
-        return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], **others)
-
-    def to_yaml(self) -> str:
-        """One line of YAML."""
-        values = self.model_dump(exclude_defaults=True)
-        order = [k for k in ("width", "height", "fx", "fy", "cx", "cy", "distortion") if k in values]
-        return "{" + ", ".join(f"{k}: {_plain(values[k])}" for k in order) + "}"
-
-
-def _plain(value: Any) -> str:
-    """A value as YAML has it."""
-    return f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
-
-
 class Topics(Settings):
     """Which topics of a ROS bag to read, where types and names do not tell."""
 
@@ -115,7 +54,7 @@ class Topics(Settings):
     action: str | None = None
 
 
-class Metadata(_FiniteSettings):
+class Metadata(FiniteSettings):
     """The keys of ``recording.yaml``; every one is optional where the layout itself tells."""
 
     color: PathInside = "color"

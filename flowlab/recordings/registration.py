@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from flowlab.recordings.metadata import Intrinsics
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.lens import undistorted_rays
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,7 @@ class Registration:
 
 def _rays(pixels: np.ndarray, camera: Intrinsics) -> np.ndarray:
     """x / z and y / z of pixel coordinates (..., 2)."""
-    flat = pixels.reshape(-1, 1, 2).astype(np.float64)
-    return cv2.undistortPoints(flat, camera.K, np.array(camera.distortion or (0.0,) * 5)).reshape(pixels.shape)
+    return undistorted_rays(camera.lens, camera.K, camera.distortion, pixels)
 
 
 @numba.njit(cache=True)

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, UInt8
 from flowlab.errors import DataError, UsageError
 from flowlab.files import new_folder
 from flowlab.geometry.camera import Camera
-from flowlab.recordings.metadata import FILE_NAME, Intrinsics
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.metadata import FILE_NAME
 
 _MAX_COUNT = np.iinfo(np.uint16).max
 

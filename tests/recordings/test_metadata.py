@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import load_readers
-from flowlab.recordings.metadata import Intrinsics, Metadata, combine, load_metadata
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.metadata import Metadata, combine, load_metadata
 from flowlab.recordings.readers.plain import write_rgbd_recording
 from flowlab.recordings.recording import RecordingSettings, describe
 

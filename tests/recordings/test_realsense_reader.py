@@ -122,7 +122,7 @@ def test_the_sdk_reads_its_bag_and_so_do_we(sdk_bag: Path, cache: Path) -> None:
     assert 2 <= len(recording) <= STEPS
     np.testing.assert_array_equal(recording.camera.K, K)
     assert recording.extras["depth_unit_m"] == UNIT
-    assert said(recording, "registration") == "depth is registered to color, as the layout says"
+    assert said(recording, "registration").startswith("depth is registered to color, as the layout says")
     np.testing.assert_allclose(np.diff(recording.time_s), 1 / FPS)
     truth, seen_t = counts(STEPS, SIZE).astype(np.float32) * np.float32(UNIT), []
     for k in range(len(recording)):

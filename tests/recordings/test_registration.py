@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from thoroughness import examples
 
-from flowlab.recordings.metadata import Intrinsics
+from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.registration import Registration
 
 DEPTH = Intrinsics(fx=60.0, fy=62.0, cx=39.2, cy=29.1)

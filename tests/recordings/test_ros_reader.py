@@ -154,7 +154,7 @@ def test_every_kind_of_recording_is_read(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(recording.time_s, np.arange(STEPS) / 10, atol=1e-6)
     np.testing.assert_array_equal(recording.state, np.arange(7) + 3 * np.arange(STEPS)[:, None])
     assert recording.extras["reader"] == "ros"
-    assert said(recording, "registration") == "depth is registered to color, as the layout says"
+    assert said(recording, "registration").startswith("depth is registered to color, as the layout says")
     assert recording.extras["depth_unit_m"] == 0.001
     assert recording.extras["origin"]["intrinsics"] == "/camera/color/camera_info"
     assert recording.extras["max_sync_error_s"]["depth"] == pytest.approx(0.002, abs=1e-5)
@@ -316,7 +316,7 @@ def test_unregistered_depth_asks_for_the_transform(tmp_path: Path) -> None:
     given = write_yaml(tmp_path / "c.yaml", T_color_depth=np.eye(4).tolist())
     recording = opened(path, calibration=given)
     assert_frames(recording, list(range(STEPS)))
-    assert said(recording, "registration") == "depth is registered to color by flowlab"
+    assert said(recording, "registration").startswith("depth is registered to color by flowlab")
     assert recording.extras["origin"]["depth_intrinsics"] == "/camera/depth/camera_info"
 
 

@@ -11,7 +11,8 @@ from flowlab.array_files import map_array, map_member
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.image_files import check_depth
-from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.text import cut

@@ -10,7 +10,8 @@ from flowlab.errors import DataError, first_line
 from flowlab.recordings.base import Streams
 from flowlab.recordings.file_stamps import read_names
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
-from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, load_metadata
+from flowlab.recordings.intrinsics import Intrinsics, is_transposed
+from flowlab.recordings.metadata import FILE_NAME, Metadata, load_metadata
 from flowlab.recordings.sample_files import load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.writing import write_rgbd_recording
@@ -67,7 +68,8 @@ def open3d_calibration(path: Path) -> tuple[tuple[str, Metadata], ...]:
             continue
         values = read_json(file, f"give 'intrinsics' in {FILE_NAME}")
         try:
-            K = np.array(values["intrinsic_matrix"], float).reshape(3, 3).T  # Open3D writes it by columns
+            K = np.array(values["intrinsic_matrix"], float).reshape(3, 3)
+            K = K.T if is_transposed(K) else K  # Open3D writes it by columns, others nest its rows
             size = {"width": int(values["width"]), "height": int(values["height"])}
             found = {"intrinsics": Intrinsics.from_matrix(K, **size)}
             scale = values.get("depth_scale")

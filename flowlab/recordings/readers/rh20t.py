@@ -5,6 +5,7 @@ tcp/<ms>.npy and gripper_command/<ms>.npy in the episode or in the camera's fold
 calib/<calibration>/{intrinsics,extrinsics}.npy beside the episode or above it
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from flowlab.errors import DataError
 from flowlab.geometry.transforms import inverse
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import COLOR_SUFFIXES, color_stream, depth_stream, list_images
-from flowlab.recordings.metadata import FILE_NAME, Intrinsics, Metadata, check_rigid
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.metadata import FILE_NAME, Metadata, check_rigid
 from flowlab.recordings.readers.safe_pickle import pickled_numbers
 from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.stamps import Timing
@@ -52,12 +54,14 @@ class RH20TReader:
         depth = _timed(folder / "depth", (".png",))
         calibration, checks = _calibration(episode, serial, about)
         success = {"success": float(about["rating"]) > 1} if "rating" in about else {}
-        known = Metadata(depth_unit_m=0.00025 if "f" in serial else 0.001, **success)
+        l515 = re.fullmatch(r"f\d{7}", serial) is not None
+        known = Metadata(depth_unit_m=0.00025 if l515 else 0.001, **success)
+        custom = f"the custom of RH20T for {'an L515' if l515 else 'all but the L515'}, by the serial {shown(serial)}"
         return Streams(
             color_stream(*color),
             depth_stream(*depth),
             state=_state([folder, episode]),
-            known=(*calibration, ("the custom of RH20T", known)),
+            known=(*calibration, (custom, known)),
             registered=True,
             checks=checks,
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
+from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.metadata import FILE_NAME, Metadata, Topics
 from flowlab.recordings.readers.joint_states import JointGroup, join_by_name
 from flowlab.recordings.readers.realsense import is_sdk_bag
@@ -26,7 +27,7 @@ from flowlab.recordings.readers.ros_messages import (
 from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import cut
+from flowlab.text import cut, shown
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -36,6 +37,8 @@ REGISTERED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_col
 """What the topics of depth that is seen from the color camera are called."""
 COMPRESSED = ("compressed", "compressedDepth")
 SDK_UNIT = "/option/Depth_Units/value"
+_ALIKE = 0.01
+"""Intrinsics are the same where they differ by less than this, of the focal length."""
 
 
 class ROSReader:
@@ -60,8 +63,8 @@ class ROSReader:
         topics = choose_topics(bag, given)
         indices = {topic: bag.index(topic) for topic in dict.fromkeys(topics.all())}
         streams = {t: _Topic(bag, t, i) for t, i in indices.items()}
-        registered, known = _calibration(bag, topics)
-        checks = [Check("topics", Verdict.OK, f"read are {', '.join(topics.all())}")]
+        registered, known, told = _calibration(bag, topics, given)
+        checks = [Check("topics", Verdict.OK, f"read are {', '.join(topics.all())}"), *told]
         robot: dict[str, tuple[SampleStream, ...]] = {}
         for what, topic in (("state", topics.state), ("action", topics.action)):
             robot[what], told = ((), []) if topic is None else streams[topic].samples(what)
@@ -164,22 +167,69 @@ def _info_of(topic: str, infos: Mapping[str, int]) -> str | None:
     return beside if beside in infos else None
 
 
-def _calibration(bag: RosBag, topics: ChosenTopics) -> tuple[bool, tuple[tuple[str, Metadata], ...]]:
-    """Whether depth is registered, and what CameraInfo and static transforms tell."""
+def _calibration(
+    bag: RosBag, topics: ChosenTopics, given: Metadata
+) -> tuple[bool | None, list[tuple[str, Metadata]], list[Check]]:
+    """Whether depth is registered, what CameraInfo and static transforms tell, and what was looked at.
+
+    What the user gives is not asked of the recording, so that it may be wrong there.
+    """
     frames = [bag.first(t).header.frame_id for t in (topics.color, topics.depth)]
-    registered = any(name in topics.depth for name in REGISTERED) or (frames[0] == frames[1] != "")
-    known: list[tuple[str, dict[str, Any]]] = []
-    if topics.color_info is not None:
-        known.append((topics.color_info, {"intrinsics": intrinsics_of(bag.first(topics.color_info), topics.color)}))
-    if not registered and topics.depth_info is not None:
-        camera = intrinsics_of(bag.first(topics.depth_info), topics.depth)
-        known.append((topics.depth_info, {"depth_intrinsics": camera}))
-    if not registered:
+    known: dict[str, Intrinsics | None] = {}
+    for what, info, topic in (("color", topics.color_info, topics.color), ("depth", topics.depth_info, topics.depth)):
+        known[what] = None if info is None else _asked(bag, info, topic, given, what)
+    registered, check = _registered(topics, frames, known["color"], known["depth"])
+    found: list[tuple[str | None, dict[str, Any]]] = [(topics.color_info, {"intrinsics": known["color"]})]
+    if registered is False:
+        found.append((topics.depth_info, {"depth_intrinsics": known["depth"]}))
         static = [t for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")
                   for _, message in bag.messages(topic) for t in message.transforms]  # fmt: skip
-        T_color_depth = relative_pose(static, *frames)
-        known.append(("/tf_static", {"T_color_depth": None if T_color_depth is None else T_color_depth.tolist()}))
-    return registered, tuple((name, Metadata(**values)) for name, values in known)
+        # Cameras that see differently and yet are said to be one and the same are not where that says.
+        T_color_depth = None if frames[0] == frames[1] else relative_pose(static, *frames)
+        found.append(("/tf_static", {"T_color_depth": None if T_color_depth is None else T_color_depth.tolist()}))
+    return registered, [(name, Metadata(**values)) for name, values in found if name is not None], [check]
+
+
+def _asked(bag: RosBag, info: str, topic: str, given: Metadata, what: str) -> Intrinsics | None:
+    """The intrinsics that a CameraInfo tells, where the user does not."""
+    own = given.intrinsics if what == "color" else given.depth_intrinsics
+    return own if own is not None else intrinsics_of(bag.first(info), topic)
+
+
+def _registered(
+    topics: ChosenTopics, frames: Sequence[str], color: Intrinsics | None, depth: Intrinsics | None
+) -> tuple[bool | None, Check]:
+    """Whether depth is seen from the color camera, by the names of topic and frames and by what both cameras are."""
+    differ = color is not None and depth is not None and not _alike(color, depth)
+    name = next((name for name in REGISTERED if name in topics.depth), None)
+    if name is not None and differ:
+        says = (f"{topics.depth} is called {name}, but {topics.depth_info} tells of another camera "
+                f"({_words(depth)}) than {topics.color_info} ({_words(color)}); choose another topic with "
+                "'topics: {depth: ...}', or give 'depth_intrinsics' and 'T_color_depth'")  # fmt: skip
+        return True, Check("camera_info", Verdict.REFUSED, says)
+    if name is not None:
+        return True, Check("camera_info", Verdict.OK, f"{topics.depth} is registered to color, as its name says")
+    if not frames[0] == frames[1] != "":
+        says = f"color is seen from frame '{shown(frames[0])}', depth from '{shown(frames[1])}'"
+        return False, Check("camera_info", Verdict.OK, says)
+    where = f"color and depth are both in frame '{shown(frames[0])}'"
+    if differ:
+        says = f"{where}, but seen by different cameras: {_words(depth)} and {_words(color)}; not taken as registered"
+        return False, Check("camera_info", Verdict.OK, says)
+    if depth is None or color is None:
+        return None, Check("camera_info", Verdict.ASSUMED, f"{where}; whether by the same camera is not told")
+    return True, Check("camera_info", Verdict.OK, f"{where}, with the same intrinsics")
+
+
+def _alike(a: Intrinsics, b: Intrinsics) -> bool:
+    """Whether two cameras see the same, up to the size of their pictures."""
+    scale = (a.width or b.width or 1) / (b.width or a.width or 1)
+    at = np.array([[c.fx, c.fy, c.cx, c.cy] for c in (a, b)]) * [[1], [scale]]
+    return bool(np.abs(at[0] - at[1]).max() < _ALIKE * at[0, 0])
+
+
+def _words(camera: Intrinsics | None) -> str:
+    return "" if camera is None else f"fx {camera.fx:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}"
 
 
 def _unit(bag: RosBag, depth: str) -> tuple[str, Metadata]:

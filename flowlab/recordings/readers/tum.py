@@ -8,7 +8,8 @@ import numpy as np
 from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
-from flowlab.recordings.metadata import Intrinsics, Metadata
+from flowlab.recordings.intrinsics import Intrinsics
+from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import is_path_inside, shown

@@ -1,0 +1,112 @@
+"""Whether depth is in the unit that is said, by what it makes of the scene."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flowlab.recordings.verdicts import Check, Verdict
+
+if TYPE_CHECKING:
+    from flowlab.recordings.parsing import ParsedRecording
+
+CUSTOM = "the custom of "
+"""Begins the origin of what no file says."""
+_UNITS = (1.0, 0.001, 0.00025, 0.0001, 0.0002)
+_POSSIBLE_M = (0.02, 100.0)
+"""The median depth of a recording lies between these [m]."""
+_WORKSPACE_M = (0.15, 5.0)
+"""A camera that sees a robot at work has its median depth between these [m]."""
+_SENSED_M = (0.15, 10.0)
+"""Where depth cameras measure [m]."""
+_SATURATED = 65535
+_VARIED = 50
+"""So many different readings tell the step between them."""
+
+
+def likely_unit(median_counts: float) -> str:
+    """The unit that would put readings into a workspace, as what to write."""
+    usual = (1.0, 0.001, 0.0001)
+    likely = next((u for u in usual if _POSSIBLE_M[0] < median_counts * u < _WORKSPACE_M[1]), 0.001)
+    return f"'depth_unit_m: {likely}' would make that {median_counts * likely:.3g} m"
+
+
+@dataclass(frozen=True, slots=True)
+class _Readings:
+    """Readings of all sampled frames."""
+
+    median: float
+    low: float
+    high: float
+    """The 5th and the 95th of a hundred."""
+    step: float
+    """What all are multiples of; 0 where that cannot be told."""
+    counts: np.ndarray
+
+    @classmethod
+    def of(cls, source: "ParsedRecording") -> "_Readings | None":
+        """None without any."""
+        found = [s.depth[np.isfinite(s.depth) & (s.depth > 0)].ravel() for s in source.frame_check.samples]
+        readings = np.concatenate(found) if found else np.empty(0)
+        saturated = (readings == _SATURATED) if readings.dtype.kind in "iu" else np.zeros(len(readings), bool)
+        readings = readings[~saturated]
+        if not readings.size:
+            return None
+        low, median, high = np.percentile(readings, (5, 50, 95))
+        varied = np.unique(readings) if readings.dtype.kind in "iu" else np.empty(0)
+        step = float(np.gcd.reduce(varied.astype(np.int64))) if len(varied) >= _VARIED else 0.0
+        return cls(float(median), float(low), float(high), step, readings)
+
+
+def check_depth_unit(source: "ParsedRecording") -> Iterator[Check]:
+    """What the unit makes of the readings; one check, or none where there is no unit or no reading."""
+    unit, readings = source.metadata.depth_unit_m, _Readings.of(source)
+    if unit is None or readings is None:
+        return
+    origin = source.origin.get("depth_unit_m", "")
+    verdict, why = _judged(unit, readings, origin.startswith(CUSTOM))
+    if verdict in (Verdict.OK, Verdict.ASSUMED):
+        verdict, why = _contradicted(source, unit, readings) or (verdict, why)
+    says = f"{unit:g} m a count, from {origin}{_scene(unit, readings)}{why}"
+    if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL):
+        says += f"; write 'depth_unit_m' into {source.write_to}"
+        if not _WORKSPACE_M[0] < unit * readings.median < _WORKSPACE_M[1]:
+            says += f" ({likely_unit(readings.median)})"
+    yield Check("depth unit", verdict, says)
+
+
+def _scene(unit: float, readings: _Readings) -> str:
+    """The scene in numbers."""
+    inside = np.mean((readings.counts * unit > _SENSED_M[0]) & (readings.counts * unit < _SENSED_M[1]))
+    step = f", in steps of {1000 * unit * readings.step:.3g} mm" if readings.step else ""
+    return (f": a median of {readings.median:g} counts is {unit * readings.median:.3g} m, nine tenths lie from "
+            f"{unit * readings.low:.3g} to {unit * readings.high:.3g} m, {inside:.0%} within "
+            f"{_SENSED_M[0]} to {_SENSED_M[1]:g} m{step}")  # fmt: skip
+
+
+def _judged(unit: float, readings: _Readings, custom: bool) -> tuple[Verdict, str]:
+    """A unit that somebody wrote is refused where it is impossible; one of custom where it is not likely."""
+    median, high = unit * readings.median, unit * readings.high
+    if not _POSSIBLE_M[0] < median < _POSSIBLE_M[1]:
+        return Verdict.REFUSED, ", which cannot be"
+    likely = _WORKSPACE_M[0] < median < _WORKSPACE_M[1]
+    if not custom:
+        return (Verdict.OK, "") if likely or median < _SENSED_M[1] else (Verdict.DOUBTFUL, ", far for a depth camera")
+    if not likely or high > 2 * _SENSED_M[1]:
+        return Verdict.REFUSED, ", which is not a robot's workspace, and no file says that unit"
+    if readings.step >= 5 and unit * readings.step > 0.004:
+        return Verdict.DOUBTFUL, ", coarser than depth cameras are: the counts may be of a smaller unit"
+    return Verdict.ASSUMED, ""
+
+
+def _contradicted(source: "ParsedRecording", unit: float, readings: _Readings) -> tuple[Verdict, str] | None:
+    """Where another source says another unit; the user's word holds unless the scene speaks for the other."""
+    for name, known in source.streams.known:
+        other = known.depth_unit_m
+        if other is None or name.startswith(CUSTOM) or abs(other / unit - 1) < 0.01:
+            continue
+        mine, theirs = (_WORKSPACE_M[0] < u * readings.median < _WORKSPACE_M[1] for u in (unit, other))
+        verdict = Verdict.REFUSED if theirs and not mine else Verdict.DOUBTFUL
+        return verdict, f", but {name} says {other:g} m, which would make the median {other * readings.median:.3g} m"
+    return None

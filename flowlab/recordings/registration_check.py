@@ -1,0 +1,196 @@
+"""Whether depth is seen from the color camera: edges of depth against edges of color, over shift and scale."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from flowlab.recordings.lens import undistorted_rays
+from flowlab.recordings.picture_samples import PictureSample
+from flowlab.recordings.verdicts import Check, Verdict
+
+if TYPE_CHECKING:
+    from flowlab.recordings.parsing import ParsedRecording
+
+_FRAMES = 6
+"""So many frames are looked at."""
+_SCALES = np.exp(np.linspace(-0.3, 0.3, 21))
+"""Depth is tried at these sizes around the middle of the picture."""
+_SHIFT = 0.15
+"""Shifts up to this share of the width are tried."""
+_GAP = 12
+"""Readings that lie apart by no more pixels without one are compared, too."""
+_JUMP = 0.05
+"""Where depth jumps by this share there is the edge of a thing."""
+_EDGES = 60
+"""Fewer pixels of edges tell nothing."""
+_CLARITY = (4.0, 5.0)
+"""The best place is above all places by so many standard deviations, for a doubt and for a refusal."""
+_GAIN = (0.12, 0.35)
+"""Likewise, it is this much better than where depth lies."""
+_SHARE = (0.012, 0.03)
+"""Likewise, the worst corner is this far off, of the picture's width."""
+
+
+@dataclass(frozen=True, slots=True)
+class Misalignment:
+    """How depth must be moved so that its edges lie on those of color, by the picture's middle."""
+
+    shift_px: tuple[float, float]
+    """In pixels of the source."""
+    scale: float
+    share: float
+    """How far the worst corner is off, of the picture's width."""
+    clarity: float
+    """How many standard deviations the best place is above all places."""
+    gain: float
+    """How much better the best place is than where depth lies, 0 to 1 and more."""
+    edges: int
+    """Pixels of depth edges in a frame."""
+
+
+def estimate_misalignment(samples: Sequence[PictureSample]) -> Misalignment | None:
+    """How far depth is from lying on color; None where there are not enough edges to tell."""
+    some = [samples[k] for k in np.unique(np.linspace(0, len(samples) - 1, min(_FRAMES, len(samples))).astype(int))]
+    pairs = [(_depth_edges(s.depth), _color_edges(s.gray)) for s in some if s.depth.shape == s.gray.shape]
+    pairs = [(d, c) for d, c in pairs if np.count_nonzero(d) >= _EDGES]
+    if not pairs:
+        return None
+    width = pairs[0][0].shape[2]
+    reach = max(2, round(_SHIFT * width))
+    scores = np.stack([_scores(pairs, scale, reach) for scale in _SCALES])
+    at = np.unravel_index(scores.argmax(), scores.shape)
+    spread, mean = float(scores.std()), float(scores.mean())
+    k, dy, dx = int(at[0]), int(at[1]) - reach, int(at[2]) - reach
+    middle = len(_SCALES) // 2
+    here = float(scores[middle - 1 : middle + 2, reach - 1 : reach + 2, reach - 1 : reach + 2].max())
+    best, factor = float(scores[at]), some[0].color_factor
+    off = np.hypot(*(np.abs([dx, dy]) + abs(_SCALES[k] - 1) * np.array(pairs[0][0].shape[:0:-1]) / 2))
+    return Misalignment(
+        (dx * factor, dy * factor),
+        float(_SCALES[k]),
+        float(off / width),
+        (best - mean) / spread if spread > 0 else 0.0,
+        (best - here) / (best - mean) if best > mean else 0.0,
+        int(np.mean([np.count_nonzero(d) for d, _ in pairs])),
+    )
+
+
+def _depth_edges(counts: np.ndarray) -> Float32[np.ndarray, "2 H W"]:
+    """Where the nearer side of a jump in depth lies: across columns, and across rows."""
+    depth = np.where(np.isfinite(counts) & (counts > 0), counts, 0).astype(np.float32)
+    return np.stack([_jumps(depth), _jumps(depth.T).T])
+
+
+def _jumps(depth: np.ndarray) -> np.ndarray:
+    """Jumps from a reading to the next one of its row."""
+    edges = np.zeros(depth.shape, np.float32)
+    valid, column = depth > 0, np.arange(depth.shape[1])
+    last = np.maximum.accumulate(np.where(valid, column, -1), axis=1)
+    before = np.concatenate([np.full((len(depth), 1), -1), last[:, :-1]], axis=1)
+    row, at = np.nonzero(valid & (before >= 0) & (column - before <= _GAP))
+    left, right = depth[row, before[row, at]], depth[row, at]
+    for near, far, place in ((left, right, before[row, at]), (right, left, at)):
+        jump = far - near > _JUMP * near
+        edges[row[jump], place[jump]] = 1
+    return edges
+
+
+def _color_edges(gray: np.ndarray) -> Float32[np.ndarray, "2 H W"]:
+    """Strength of edges across columns and across rows, weak ones raised, mean 0."""
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 0.8)
+    found = np.stack([np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0)), np.abs(cv2.Sobel(smooth, cv2.CV_32F, 0, 1))])
+    found = found / (found + 20)
+    return (found - found.mean((1, 2), keepdims=True)).astype(np.float32)
+
+
+def _scores(pairs: Sequence[tuple[np.ndarray, np.ndarray]], scale: float, reach: int) -> np.ndarray:
+    """Mean strength of color edges under depth edges, for every shift (dy, dx) within reach."""
+    total = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for depth, color in pairs:
+        height, width = depth.shape[1:]
+        size = (cv2.getOptimalDFTSize(height + reach), cv2.getOptimalDFTSize(width + reach))
+        middle = np.array([(width - 1) / 2, (height - 1) / 2])
+        place = np.column_stack([scale * np.eye(2), middle * (1 - scale)])
+        spectrum, weight = np.zeros((size[0], size[1] // 2 + 1), np.complex128), 0.0
+        for axis in (0, 1):
+            moved = cv2.warpAffine(depth[axis], place, (width, height), flags=cv2.INTER_LINEAR)
+            spectrum += np.conj(np.fft.rfft2(moved, size)) * np.fft.rfft2(color[axis], size)
+            weight += float(moved.sum())
+        near = np.fft.irfft2(spectrum, size)
+        rows = np.r_[-reach : reach + 1]
+        total += near[np.ix_(rows, rows)] / max(weight, 1.0)
+    return total / len(pairs)
+
+
+def check_registration(source: "ParsedRecording") -> Check:
+    """Whether depth lies on color, by what is said of it and by the pictures."""
+    how, stated = _how(source)
+    samples = source.frame_check.samples
+    if how is None:
+        return Check("registration", Verdict.DOUBTFUL, "depth is seen from a camera of its own, and not registered yet")
+    if source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None:
+        samples = tuple(_registered(source))
+    elif source.frame_check.color_size != source.frame_check.depth_size:
+        return Check("registration", Verdict.REFUSED, f"{how}, but has another size than color; give "
+                     f"'depth_intrinsics' and 'T_color_depth' in {source.write_to}")  # fmt: skip
+    found = estimate_misalignment(samples)
+    if found is None or found.clarity < _CLARITY[0]:
+        why = "too few edges in the pictures to tell" if found is None else (
+            f"edges of depth fit edges of color nowhere well enough to tell (clarity {found.clarity:.1f})")  # fmt: skip
+        return Check("registration", Verdict.OK if stated else Verdict.ASSUMED, f"{how}; {why}")
+    where = (f"edges of depth fit those of color best when moved by ({found.shift_px[0]:g}, {found.shift_px[1]:g}) px "
+             f"and sized by {found.scale:.2f} (gain {found.gain:.2f}, clarity {found.clarity:.1f})")  # fmt: skip
+    verdict = _verdict(found)
+    if verdict is Verdict.OK:
+        return Check("registration", verdict, f"{how}, and the pictures agree: edges of depth lie on those of color")
+    advice = (f"give 'depth_intrinsics' and 'T_color_depth' in {source.write_to}, or record depth that is aligned to "
+              "color")  # fmt: skip
+    if source.metadata.T_color_depth is not None:
+        advice = f"correct 'depth_intrinsics' or 'T_color_depth' in {source.write_to}"
+    return Check("registration", verdict, f"{how}, but {where}; {advice}")
+
+
+def _verdict(found: Misalignment) -> Verdict:
+    """Depth that is off by little, or not clearly, is let pass."""
+    for k, verdict in ((1, Verdict.REFUSED), (0, Verdict.DOUBTFUL)):
+        if found.gain > _GAIN[k] and found.share > _SHARE[k] and found.clarity > _CLARITY[k]:
+            return verdict
+    return Verdict.OK
+
+
+def _how(source: "ParsedRecording") -> tuple[str | None, bool]:
+    """How depth comes to be seen from the color camera, and whether that was stated; None where it does not."""
+    known = source.metadata
+    if known.depth_intrinsics is not None and known.T_color_depth is not None:
+        return "depth is registered to color by flowlab", True
+    if known.depth_intrinsics is not None or known.T_color_depth is not None or source.streams.registered is False:
+        return None, True
+    if source.streams.registered:
+        return "depth is registered to color, as the layout says", True
+    return "depth is taken as registered to color: same size, nothing said", False
+
+
+def _registered(source: "ParsedRecording") -> list[PictureSample]:
+    """The samples with depth as the color camera sees it, by the nearest pixel of small pictures."""
+    known, found = source.metadata, []
+    camera, color, T = known.depth_intrinsics, known.intrinsics, np.array(known.T_color_depth)
+    if camera is None or color is None:
+        return []
+    for s in source.frame_check.samples:
+        v, u = np.nonzero(np.isfinite(s.depth) & (s.depth > 0))
+        z = s.depth[v, u] * (known.depth_unit_m or 1.0)
+        pixels = np.stack([u, v], -1) * s.depth_factor + (s.depth_factor - 1) // 2
+        rays = undistorted_rays(camera.lens, camera.K, camera.distortion, pixels)
+        at = np.concatenate([rays, np.ones((len(rays), 1))], 1) * z[:, None] @ T[:3, :3].T + T[:3, 3]
+        at = at[at[:, 2] > 0]
+        place = (at[:, :2] / at[:, 2:] * [color.fx, color.fy] + [color.cx, color.cy] + 0.5) / s.color_factor
+        u, v = np.floor(place).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < s.gray.shape[1]) & (v < s.gray.shape[0])
+        depth = np.full(s.gray.shape, np.inf)
+        np.minimum.at(depth, (v[inside], u[inside]), at[inside, 2])
+        found.append(replace(s, depth=np.where(np.isfinite(depth), depth, 0), depth_factor=s.color_factor))
+    return found

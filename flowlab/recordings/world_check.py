@@ -1,0 +1,168 @@
+"""Whether the pose of the camera can be what it is said to be: a table is level, and is seen from above."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from flowlab.errors import DataError
+from flowlab.geometry.transforms import inverse
+from flowlab.recordings.lens import undistorted_rays
+from flowlab.recordings.verdicts import Check, Verdict
+
+if TYPE_CHECKING:
+    from flowlab.recordings.parsing import ParsedRecording
+
+_FAR_M = (5.0, 20.0)
+"""A camera this far from the world's origin is doubtful, and refused."""
+_BASELINE_M = (0.3, 1.0)
+"""Likewise, of how far the depth camera is from the color camera."""
+_PLANE_SHARE = 0.3
+"""A plane that so many of the points lie on is one of the scene."""
+_LEVEL_DEG = 8.0
+"""A table is level to within this."""
+_TILTED_DEG = 20.0
+"""A plane that is tilted by more against every axis of the world is neither a table nor a wall."""
+_TRIES = 150
+_OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Plane:
+    """The plane that most points lie on, as the camera sees it."""
+
+    normal: Float64[np.ndarray, "3"]
+    """Towards the camera."""
+    distance_m: float
+    """Of the camera."""
+    share: float
+    """Of the points, those that lie on it."""
+
+
+def check_world(source: "ParsedRecording") -> Iterator[Check]:
+    """Where the camera stands and looks, and whether that agrees with a plane in the cloud."""
+    T_color_depth = source.metadata.T_color_depth
+    if T_color_depth is not None:
+        yield from _baseline(float(np.linalg.norm(np.array(T_color_depth)[:3, 3])), source.write_to)
+    if source.metadata.T_world_cam is None:
+        says = "T_world_cam is not given, so the world is the camera's own frame: x right, y down, z forward"
+        yield Check("world", Verdict.ASSUMED, says)
+        return
+    T = np.array(source.metadata.T_world_cam, float)
+    if np.allclose(T[:3, :3], np.eye(3), atol=1e-6):
+        says = "T_world_cam turns nothing, so the world has the camera's axes: x right, y down, z forward"
+        yield Check("world", Verdict.ASSUMED, says)
+        return
+    stands = f"{_stands(T)}, from {source.origin.get('T_world_cam', '')}"
+    far = float(np.linalg.norm(T[:3, 3]))
+    if far > _FAR_M[0]:
+        verdict = Verdict.REFUSED if far > _FAR_M[1] else Verdict.DOUBTFUL
+        unit = ", as if in millimeters" if far > _FAR_M[1] else ""
+        says = (
+            f"{stands}: {far:.4g} m from the world's origin{unit}; write 'T_world_cam' in {source.write_to} in meters"
+        )
+        yield Check("world", verdict, says)
+        return
+    plane = _dominant_plane(_cloud(source))
+    yield _judged(T, plane, stands, source.write_to)
+
+
+def _baseline(far: float, write_to: str) -> Iterator[Check]:
+    if far > _BASELINE_M[0]:
+        verdict = Verdict.REFUSED if far > _BASELINE_M[1] else Verdict.DOUBTFUL
+        yield Check("T_color_depth", verdict, f"the depth camera is {far:.4g} m from the color camera; it must be "
+                    "in meters, and map coordinates of the depth camera to the color camera; "
+                    f"correct it in {write_to}")  # fmt: skip
+
+
+def _stands(T: np.ndarray) -> str:
+    """Where a camera is and looks, in words and numbers."""
+    x, y, z = T[:3, 3]
+    down = np.degrees(np.arcsin(np.clip(-T[2, 2], -1, 1)))
+    tilt = f"{abs(down):.0f} degrees {'down' if down >= 0 else 'up'}"
+    ahead = "" if abs(down) > 80 else f" towards ({T[0, 2]:.2f}, {T[1, 2]:.2f}, {T[2, 2]:.2f})"
+    return f"the camera is at ({x:.3g}, {y:.3g}, {z:.3g}) m and looks {tilt}{ahead}"
+
+
+def _judged(T: np.ndarray, plane: _Plane | None, stands: str, write_to: str) -> Check:
+    """Whether the plane is a table that is seen from above, and whether it is one only by another reading of T."""
+    if plane is None:
+        return Check("world", Verdict.ASSUMED, f"{stands}; no plane in the cloud tells whether that is so")
+    seen = f"the plane with {plane.share:.0%} of the points, {plane.distance_m:.2f} m from the camera,"
+    others = {
+        "the inverse, world to camera": inverse(T),
+        "in OpenGL's axes (y up, z backward)": T @ _OPENGL,
+        "the inverse, in OpenGL's axes": inverse(T) @ _OPENGL,
+        "the inverse of one in OpenGL's axes": inverse(_OPENGL @ T),
+    }
+    fit = {how: _tilt(other, plane) for how, other in others.items()}
+    tilt, axis = _tilt(T, plane), _off_axes(T, plane)
+    better = [how for how, off in fit.items() if off < _LEVEL_DEG]
+    if tilt < _LEVEL_DEG:
+        height = T[2, 3] - plane.distance_m * float(T[2, :3] @ plane.normal)
+        says = f"{stands}; {seen} is level and seen from above, at the height {height:.2f} m"
+        same = [how for how in better if not np.allclose(others[how], T, atol=0.02)]
+        if same:
+            return Check("world", Verdict.ASSUMED, f"{says}; it would be so as {same[0]}, too")
+        return Check("world", Verdict.OK, says)
+    how = f"{seen} is tilted by {tilt:.0f} degrees against the world's xy-plane"
+    if better and (axis > _LEVEL_DEG or tilt > 180 - _LEVEL_DEG):
+        says = (f"{stands}; {how}, and level if T_world_cam were {better[0]}; it must map coordinates of the camera "
+                f"(x right, y down, z forward) to the world's (z up): correct it in {write_to}")  # fmt: skip
+        return Check("world", Verdict.REFUSED if axis > _TILTED_DEG or tilt > 90 else Verdict.DOUBTFUL, says)
+    if axis < _LEVEL_DEG and tilt < 180 - _LEVEL_DEG:
+        return Check("world", Verdict.ASSUMED, f"{stands}; {how}, so it may be a wall, or the world has another up")
+    return Check("world", Verdict.ASSUMED, f"{stands}; {how}: look whether that is so")
+
+
+def _tilt(T: np.ndarray, plane: _Plane) -> float:
+    """Angle between the plane's normal and the world's z axis [degrees]; 180 for a ceiling."""
+    return float(np.degrees(np.arccos(np.clip(T[2, :3] @ plane.normal, -1, 1))))
+
+
+def _off_axes(T: np.ndarray, plane: _Plane) -> float:
+    """Angle between the plane's normal and the nearest axis of the world [degrees]."""
+    return float(np.degrees(np.arccos(np.clip(np.abs(T[:3, :3] @ plane.normal).max(), -1, 1))))
+
+
+def _cloud(source: "ParsedRecording") -> Float64[np.ndarray, "N 3"]:
+    """Points of one frame as the camera that took depth sees them [m]; none where cameras are not known."""
+    known, sample = source.metadata, source.frame_check.samples[0]
+    camera = known.depth_intrinsics or known.intrinsics
+    if camera is None or known.depth_unit_m is None:
+        return np.empty((0, 3))
+    v, u = np.nonzero(np.isfinite(sample.depth) & (sample.depth > 0))
+    z = sample.depth[v, u].astype(float) * known.depth_unit_m
+    pixels = np.stack([u, v], -1) * sample.depth_factor + (sample.depth_factor - 1) // 2
+    try:
+        rays = undistorted_rays(camera.lens, camera.K, camera.distortion, pixels)
+    except DataError:  # of a lens that is refused
+        return np.empty((0, 3))
+    cloud = np.concatenate([rays, np.ones((len(rays), 1))], 1) * z[:, None]
+    T = known.T_color_depth
+    return cloud if T is None or known.depth_intrinsics is None else cloud @ np.array(T)[:3, :3].T + np.array(T)[:3, 3]
+
+
+def _dominant_plane(cloud: Float64[np.ndarray, "N 3"]) -> _Plane | None:
+    """The plane with most points, by trying planes through three of them; None where none has enough."""
+    cloud = cloud[np.isfinite(cloud).all(1)]
+    if len(cloud) < 200:
+        return None
+    rng = np.random.default_rng(0)
+    some = cloud[rng.choice(len(cloud), min(len(cloud), 1500), replace=False)]
+    corners = some[rng.integers(0, len(some), (_TRIES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 1e-9)
+    offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
+    near = np.maximum(0.008, 0.008 * some[:, 2] ** 2)
+    on = (np.abs(some @ normals.T - offsets) < near[:, None]) & (length[:, 0] > 1e-9)
+    inside = some[on[:, on.sum(0).argmax()]]
+    if len(inside) < _PLANE_SHARE * len(some):
+        return None
+    middle = inside.mean(0)
+    normal = np.linalg.svd(inside - middle, full_matrices=False)[2][2]
+    normal = normal if normal @ middle < 0 else -normal
+    return _Plane(normal, float(-normal @ middle), len(inside) / len(some))
