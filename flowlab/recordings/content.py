@@ -2,7 +2,7 @@
 
 import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int64, Num
 
 from flowlab.recordings.base import BadImage, ImageStream, Streams
+from flowlab.recordings.motion import Motion, check_motion
 from flowlab.recordings.verdicts import Check, Verdict
 
 _SAMPLES = 5
@@ -44,6 +45,36 @@ def digest(picture: np.ndarray) -> PictureDigest:
     step = max(1, gray.shape[0] // 24), max(1, gray.shape[1] // 32)
     small = np.nan_to_num(gray[:: step[0], :: step[1]].astype(np.float32), posinf=0, neginf=0)
     return PictureDigest(zlib.crc32(np.ascontiguousarray(picture).tobytes()), small)
+
+
+def motion_of(name: str, stream: ImageStream, digests: Mapping[int, PictureDigest]) -> Motion:
+    """When the pictures of a stream change, of those that were looked at."""
+    kept = sorted(digests)
+    change = np.array([_change(digests[a], digests[b]) for a, b in pairwise(kept)], np.float64)
+    return Motion.make(name, stream.time_s[kept], change)
+
+
+def motion_checks(
+    streams: Streams, color: Mapping[int, PictureDigest], depth: Mapping[int, PictureDigest], stated: Sequence[str]
+) -> tuple[Check, ...]:
+    """Whether depth and the robot move when the color pictures change.
+
+    Args:
+        streams: The recording.
+        color: What is kept of color pictures, by index.
+        depth: Likewise of depth pictures.
+        stated: Names of the streams of which the user says how they belong to color: depth, state.
+    """
+    if len(color) < 2 or len(depth) < 2:
+        return ()
+    pictures = motion_of("color", streams.color, color)
+    found = [check_motion(pictures, motion_of("depth", streams.depth, depth), "depth" in stated)]
+    for s in streams.state[:1]:
+        if len(s.time_s) > 1 and s.values.shape[1]:
+            reach = np.maximum(np.ptp(s.values, axis=0), 1e-9)
+            change = np.linalg.norm(np.diff(s.values, axis=0) / reach, axis=1).astype(np.float64)
+            found.append(check_motion(pictures, Motion.make("the robot", s.time_s, change), "state" in stated))
+    return tuple(found)
 
 
 # --- readings that are none -------------------------------------------------------------------------------

@@ -1,14 +1,14 @@
 """The first pass over a recording: which frames make rows, and which are bad, by name and reason."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
-from flowlab.recordings.content import PictureDigest, digest, find_repeats
+from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.sync import nearest_sample, sampling_rate
@@ -65,13 +65,21 @@ class _ImageCheck:
 
 
 def check_frames(
-    streams: Streams, *, every: int, start_s: float, stop_s: float | None, max_sync_s: float, max_state_s: float
+    streams: Streams,
+    *,
+    every: int,
+    start_s: float,
+    stop_s: float | None,
+    max_sync_s: float,
+    max_state_s: float,
+    stated: Sequence[str] = (),
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
-    an interval; and where its time does not lie after the frame before.
+    an interval; and where its time does not lie after the frame before. ``stated`` are the streams of which the user
+    says how they belong to color.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
@@ -104,24 +112,18 @@ def check_frames(
         good.append((i, j))
         last = clock[k]
     rows = np.array(good, np.int64).reshape(-1, 2)
-    frozen, repeats = _find_frozen(streams, color, depth, rows)
+    digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
+    state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
+    frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
+    checks = (repeats, *motion_checks(streams, digests[0], digests[1], stated))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     rows = np.delete(rows, list(frozen), axis=0)
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
     return FrameCheck(
-        rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, (repeats,), samples
+        rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples
     )
-
-
-def _find_frozen(
-    streams: Streams, color: Mapping[int, _ImageCheck], depth: Mapping[int, _ImageCheck], rows: Int64[np.ndarray, "T 2"]
-) -> tuple[dict[int, str], Check]:
-    """Good rows whose picture only came again, and the check of that."""
-    digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
-    state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
-    return find_repeats(streams, digests[0], digests[1], rows, state)
 
 
 def _samples(

@@ -149,6 +149,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         stop_s=settings.stop_s,
         max_sync_s=settings.max_sync_s,
         max_state_s=settings.max_state_s,
+        stated=[name for name in ("depth", "state") if getattr(metadata, f"{name}_offset_s") is not None],
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
 

@@ -344,3 +344,30 @@ def test_a_wall_behind_a_box_is_a_reading(tmp_path: Path, inspect: Inspect) -> N
         write_png(path / "depth" / f"{t:06d}.png", np.where(picture(t)[1] > 800, 900, 600).astype(np.uint16))
     facts = assert_fine(inspect(path))
     assert {c["verdict"] for c in facts["checks"] if c["about"] == "saturated depth"} == {"ok"}
+
+
+def shaken(late: int, frames: int = 80) -> list[int]:
+    """Which picture is shown when: a block that moves in fits and starts."""
+    rng = np.random.default_rng(3)
+    steps = rng.choice([0, 1, 2, 3], frames + late, p=[0.4, 0.2, 0.2, 0.2])
+    return [int(k) for k in np.cumsum(steps)[late:]]
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_motion_tells_an_offset_that_numbers_do_not(tmp_path: Path, inspect: Inspect, late: int) -> None:
+    """Both are counted from 0 without a hole, and depth begins three frames later."""
+    moves = [np.array([(10 * k) % 25 for k in shaken(n)]) for n in (0, late)]
+    for which, folder in ((0, "color"), (1, "depth")):
+        for t, k in enumerate(moves[which]):
+            shown = np.full((24, 32), 900, np.uint16) if which else np.full((24, 32, 3), 90, np.uint8)
+            shown[8:16, k : k + 7] = 600 if which else 230
+            shown[0, 0] = 800 + t % 90 if which else t % 90
+            write_png(tmp_path / "r" / folder / f"{t:04d}.png", shown)
+    keys = {"fps": 30, "depth_unit_m": 0.001, "intrinsics": INTRINSICS}
+    write_yaml(tmp_path / "r" / "recording.yaml", **keys)
+    if not late:
+        assert_fine(inspect(tmp_path / "r"))
+        return
+    assert_refused(inspect(tmp_path / "r"), "motion of depth: 0.10 s before that of color", "'depth_offset_s: 0.1'")
+    write_yaml(tmp_path / "r" / "recording.yaml", **keys, depth_offset_s=0.1)
+    assert_fine(inspect(tmp_path / "r"))
