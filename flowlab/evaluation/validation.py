@@ -22,9 +22,9 @@ from flowlab.policies.checkpoint import (
     read_run_config,
     read_trained,
 )
-from flowlab.storage.validation import Finding
+from flowlab.storage.validation import Finding, finding_of
 from flowlab.training.metrics import METRICS
-from flowlab.untrusted import read_json
+from flowlab.untrusted import is_there, read_json
 from flowlab.viz.training_metrics import metrics_lines
 
 
@@ -47,8 +47,7 @@ def validate_run(path: Path) -> Iterator[Finding]:
         try:
             check()
         except DataError as error:
-            place, separator, problem = str(error).partition(": ")
-            finding = Finding(place, problem) if separator else Finding(str(path), place)
+            finding = finding_of(path, error)
             if finding not in seen:  # what is wrong with policy.json, all that is read with it meets
                 seen.add(finding)
                 yield finding
@@ -63,7 +62,7 @@ def _check_begun(path: Path) -> None:
 def _check_plan(path: Path) -> None:
     """The plan, and the dataset that it is about."""
     planned, trained = read_run_config(path), read_trained(path)
-    if not planned.dataset.exists():
+    if not is_there(planned.dataset):
         raise DataError(f"{path / RUN}: dataset: {planned.dataset} is not there; restore it, or change where it is")
     if (found := open_training_source(planned.dataset).fingerprint) != trained.fingerprint:
         raise DataError(

@@ -21,6 +21,7 @@ from flowlab.storage.receipts import check_widths, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.storage.shard import Shard
+from flowlab.untrusted import is_there
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ class Dataset(EpisodeSequence):
 
     def __init__(self, path: Path | str) -> None:
         self._path = Path(path)
-        if not self.path.exists():
+        if not is_there(self.path):
             raise MissingFileError(f"{self.path}: there is no such folder")
         self.manifest = Manifest.read(self.path)
         self.receipts = read_receipts(self.path)

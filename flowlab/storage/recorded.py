@@ -6,6 +6,7 @@ from pathlib import Path
 from flowlab.config import PlainName, Settings
 from flowlab.errors import DataError, UsageError
 from flowlab.text import natural_key
+from flowlab.untrusted import is_there
 
 
 class Recorded(Settings):
@@ -40,7 +41,7 @@ def number_recordings(known: Sequence[Recorded], found: Sequence[Recorded]) -> t
         if twin is None:
             new[key] = one
         elif twin.source != one.source:
-            if key in new or Path(twin.source).exists():
+            if key in new or is_there(Path(twin.source)):
                 raise UsageError(
                     f"two recordings of the task '{one.task}' are called '{one.name}': {twin.source} and "
                     f"{one.source}; rename one, or give them tasks of their own with --task"

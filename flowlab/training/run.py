@@ -41,6 +41,7 @@ from flowlab.training.loggers import check_loggers, make_logger
 from flowlab.training.metrics import MetricsFile
 from flowlab.training.precision import Precision
 from flowlab.training.trainer import Trainer, TrainingProgress
+from flowlab.untrusted import is_there
 
 _UNTIMED, _TIMED = 3, 12
 """Steps made to learn how long one takes."""
@@ -174,7 +175,7 @@ def resume_run(
     with names_from_file(but=logs or ()):
         check_loggers(config.logs)
     processes = ProcessGroup(config.device, config.threads, config.precision)
-    if not config.dataset.exists():
+    if not is_there(config.dataset):
         raise DataError(
             f"{folder}: its dataset is no longer at {config.dataset}; restore it, or change 'dataset' in {folder / RUN}"
         )

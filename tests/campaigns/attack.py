@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ def main(seed: int, count: int, budget: float, only: tuple[str, ...], keep: Path
     warm_up()
     campaign = Campaign("attack", OUTCOMES, ("held",), keep)
     place = Workplace(campaign.folder)
-    chosen = [name for name in CASES if not only or name.startswith(only)]
+    chosen = [name for name in CASES if not only or any(fnmatchcase(name, asked) for asked in only)]
     for number in campaign.trials(0, min(count, len(chosen)), budget):
         name = chosen[(seed + number) % len(chosen)]
         needs, attack = CASES[name]
