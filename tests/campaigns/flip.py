@@ -55,7 +55,7 @@ _DATASET = _dataset("data", _of("train"), _of("export"))
 _REAL = _dataset("real", Reader(("viz", "real", "--png", "a.png"), ("a.png",)))
 _REJECTED = _dataset("rejected", Reader(("viz", "rejected", "--rejects", "--png", "a.png"), ("a.png",)))
 _EVAL = ("eval", "run", "--episodes", "1", "--seeds", "0", "--engine", ENGINE, "--workers", "1", "--json")
-_RUN = (Reader(("validate", "run")), Reader(_EVAL), Reader(("eval", "run", "--offline", "--data", "data", "--json")))
+_RUN = (Reader(("validate", "run")), Reader(_EVAL), Reader(("eval", "run", "--offline", "--json")))
 _STOPPED = (Reader(("validate", "stopped")), _of("resume"))
 _TRIED = (Reader(("validate", "tried")), Reader(("report", "tried", "--out", "report", "--json"), ("report",)))
 _BENCH = (Reader(("validate", "bench")), Reader(("report", "bench", "--json")), _of("bench", "--json"))
@@ -187,7 +187,7 @@ def _judge(reads: Iterator[Read], known: list[Read]) -> tuple[str, str]:
         if ended.code or _new_words(ended.err, before.ended.err):
             told = told or ended.last_line
         elif _still(ended.out) != _still(before.ended.out):
-            return "SILENT", f"{words} says: {ended.out[:1500]}"
+            return "SILENT", f"{words} says otherwise: {_first_difference(ended.out, before.ended.out)}"
         elif changed := list(compare.differences(read.made, before.made)):
             return "SILENT", f"{words} makes other {', '.join(changed[:5])}"
     return ("found", told) if told else ("harmless", "")
@@ -196,9 +196,17 @@ def _judge(reads: Iterator[Read], known: list[Read]) -> tuple[str, str]:
 def _still(text: str) -> str:
     """What a command prints, without what it measured."""
     try:
-        return json.dumps(compare.still(json.loads(text)))
+        values = compare.still(json.loads(text))
+        if isinstance(values, dict):
+            values.pop("megabytes", None)  # of whatever files there are
+        return json.dumps(values, indent=1)
     except ValueError:
         return re.sub(r"\d[\d.,]* (s|s left|windows/s)\b", "", text)
+
+
+def _first_difference(text: str, before: str) -> str:
+    lines = zip(_still(text).splitlines(), _still(before).splitlines(), strict=False)
+    return next((f"{x[:200]}, not {y[:200]}" for x, y in lines if x != y), "more or less of it")
 
 
 def _new_words(text: str, before: str) -> bool:

@@ -59,7 +59,7 @@ _EVAL = ("--episodes", "1", "--seeds", "0", *_LOCAL)
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene("extract", (), ("extract-sim", "drawer-open", "--episodes", "2", "--out", "data", *_LOCAL,
+        Scene("extract", (), ("extract-sim", "drawer-open", "--episodes", "3", "--out", "data", *_LOCAL,
                               *_options(*_SIM)), ("data",), ("data",)),
         Scene("track", ("rec",), ("track-real", "rec", "--out", "real", "--tracker", "lucas-kanade", *_LOCAL,
                                   *_options(*_REAL)), ("real",), ("real",)),
@@ -158,7 +158,8 @@ def _make_stopped(place: Workplace) -> None:
         nth = int(share * whole.operations)
         call(train.command, folder, before=lambda f=folder, n=nth: faults.arm(f, faults.KILL, n))  # type: ignore[misc]
         shutil.copytree(folder / "run", place.inputs / "stopped", dirs_exist_ok=True)
-        if call(("train", "run", "--resume"), folder).code == 0:
+        told = (folder / "run/metrics.jsonl").read_bytes() if (folder / "run/metrics.jsonl").exists() else b""
+        if told and call(("train", "run", "--resume"), folder).code == 0:
             return
         shutil.rmtree(place.inputs / "stopped")
     raise RuntimeError("no killed run could be resumed")
