@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table, say
 from flowlab.cli.paths import PATH
 from flowlab.errors import DataError
 
@@ -126,5 +126,8 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     from flowlab.storage.dataset import Dataset
     from flowlab.storage.exporters.base import make_exporter
 
-    count = make_exporter(exporter, settings).export(Dataset(dataset), out, task)
+    data = Dataset(dataset)
+    count = make_exporter(exporter, settings).export(data, out, task)
+    if data.reservation:
+        say(f"flowlab: {data.reservation}")
     echo(f"{count} episodes written to {out} for {exporter}")

@@ -1,6 +1,7 @@
 """What can be trained on: a flowlab dataset, or a store in DP3's layout."""
 
 import hashlib
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,8 @@ def source_of(dataset: Dataset) -> TrainingSource:
         raise DataError(
             f"{dataset.path}: there are no episodes to train on yet; run the command that makes the dataset again"
         )
+    if dataset.reservation:
+        _LOG.warning("flowlab: %s", dataset.reservation)
     frames = sum(ref.frames for ref in dataset.refs)
     return TrainingSource(
         dataset.path,

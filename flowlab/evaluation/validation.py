@@ -17,6 +17,7 @@ from flowlab.policies.checkpoint import (
     RUN,
     build_policy,
     has_begun,
+    lines_behind,
     load_policy,
     read_resume,
     read_run_config,
@@ -98,6 +99,9 @@ def _check_finite(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 def _check_metrics(path: Path) -> None:
     steps = [line.step for line in metrics_lines(path / METRICS)]
+    step, groups = read_resume(path) if (path / RESUME).exists() else (0, {})
+    if (found := sum(s <= step for s in steps)) < (known := lines_behind(groups)):
+        raise DataError(f"{path / METRICS}: has {found} of {known} lines up to step {step}; restore it")
     if steps != sorted(steps):
         raise DataError(f"{path / METRICS}: its steps do not rise; restore it")
 

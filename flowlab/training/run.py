@@ -2,6 +2,7 @@
 
 import copy
 import json
+import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -45,6 +46,8 @@ from flowlab.untrusted import is_there
 
 _UNTIMED, _TIMED = 3, 12
 """Steps made to learn how long one takes."""
+
+_LOG = logging.getLogger(__name__)
 
 
 class ComputeSettings(Settings):
@@ -208,6 +211,10 @@ def run(
             remove_leftovers(trainer.folder)
             logs = [make_logger(log, trainer.folder, name, settings) for log in trainer.run.logs]
             metrics = MetricsFile(trainer.folder, trainer.step, logs)
+            if metrics.lines < trainer.lines:
+                lost = f"{trainer.lines - metrics.lines} of {trainer.lines} lines"
+                _LOG.warning("flowlab: %s: %s up to step %d are lost", metrics.path, lost, trainer.step)
+                trainer.lines = metrics.lines
     try:
         return trainer.fit(metrics, report if first else _silent, should_stop)
     finally:

@@ -184,7 +184,7 @@ def _judge(reads: Iterator[Read], known: list[Read]) -> tuple[str, str]:
             return "hung", words
         if ended.traceback or not 0 <= ended.code <= 4 or (ended.code and not ended.err.strip()):
             return "traceback", f"{words}: exit code {ended.code}: {ended.err[-2500:]}"
-        if ended.code or _new_words(ended.err, before.ended.err):
+        if ended.code or _new_words(ended.err, before.ended.err) or _is_missing(ended.out):
             told = told or ended.last_line
         elif _still(ended.out) != _still(before.ended.out):
             return "SILENT", f"{words} says otherwise: {_first_difference(ended.out, before.ended.out)}"
@@ -202,6 +202,14 @@ def _still(text: str) -> str:
         return json.dumps(values, indent=1)
     except ValueError:
         return re.sub(r"\d[\d.,]* (s|s left|windows/s)\b", "", text)
+
+
+def _is_missing(text: str) -> bool:
+    """Whether `info` says that episodes are missing."""
+    try:
+        return bool(json.loads(text).get("missing"))
+    except (ValueError, AttributeError):
+        return False
 
 
 def _first_difference(text: str, before: str) -> str:
