@@ -10,15 +10,16 @@ from flowlab.text import shown
 
 
 class _Path(click.Path):
-    """A path that a file system can have, there or not; another one is told before anything looks for it."""
+    """A path that is text and that a file system can have, there or not; another is told before it is looked for."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
+            os.path.abspath(value).encode()  # whatever keeps a path, keeps it as text
             os.lstat(value)
         except (FileNotFoundError, NotADirectoryError):
             pass
         except (OSError, ValueError) as error:  # too long, a NUL or half a character in it, a folder that is locked
-            reason = getattr(error, "strerror", None) or "it has a character that no file's name has"
+            reason = getattr(error, "strerror", None) or "it is no text in UTF-8, or has a NUL; rename it"
             self.fail(f"{shown(str(value))}: cannot be looked for ({reason})", param, ctx)
         return super().convert(value, param, ctx)
 

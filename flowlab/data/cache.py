@@ -80,6 +80,8 @@ def cached_part(source: TrainingSource, fallback: Path | None, part: str, arrays
         DataError: No folder can be written, or the episodes are of different widths.
     """
     content = f"{source.cache_key}-{_FORMAT}"
+    if fallback is not None:
+        remove_leftovers(fallback / "cache")
     problems: list[str] = []
     for cache in _places(fallback, problems):
         try:

@@ -52,7 +52,7 @@ def seal(folder: Path) -> None:
     from flowlab.checksums import CHECKSUM, json_checksum, sha256_of
 
     shards = {p.name.removesuffix(".zarr.zip"): p for p in folder.rglob("*.zarr.zip") if p.is_file()}
-    for file in folder.rglob("*.json*"):
+    for file in (p for p in folder.rglob("*.json*") if p.is_file()):
         with suppress(Exception):  # what is no JSON any more has no checksum
             lines = file.read_text().split("\n") if file.suffix == ".jsonl" else [file.read_text()]
             sealed = []
@@ -64,7 +64,7 @@ def seal(folder: Path) -> None:
                     line = json.dumps(values | {CHECKSUM: json_checksum(values)})
                 sealed.append(line)
             file.write_text("\n".join(sealed))
-    for file in folder.rglob("*.safetensors"):
+    for file in (p for p in folder.rglob("*.safetensors") if p.is_file()):
         with suppress(Exception):
             _seal_tensors(file)
 

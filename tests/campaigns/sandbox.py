@@ -1,5 +1,6 @@
 """Commands run in a forked child of a program that has imported everything: a trial takes a fraction of a second."""
 
+import atexit
 import ctypes
 import os
 import pkgutil
@@ -140,6 +141,7 @@ def _run(
 
             traceback.print_exc()
             code = 1
+        atexit._run_exitfuncs()
         sys.stdout.flush()
         sys.stderr.flush()
         if os.environ.get("FLOWLAB_FAULTS"):
