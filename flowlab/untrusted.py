@@ -36,6 +36,14 @@ def check_regular(path: Path, limit: int = MAX_TEXT_BYTES) -> int:
     return found.st_size
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is a file or folder; of a path that no file system can have, or that is hidden, there is none."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # a name too long, half a character in it, a folder that may not be searched
+        return False
+
+
 def read_bytes(path: Path, limit: int = MAX_TEXT_BYTES) -> bytes:
     """All of a regular file. Raises :class:`DataError` where it cannot be read or is larger than ``limit``."""
     check_regular(path, limit)

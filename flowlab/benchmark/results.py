@@ -15,7 +15,7 @@ from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.files import remove_leftovers, told_when_unwritable, write_atomically
 from flowlab.policies.checkpoint import read_trained
-from flowlab.untrusted import read_json
+from flowlab.untrusted import is_there, read_json
 
 _ADVICE = "restore it, or delete it and the experiment does it again"
 UNITS = "units"
@@ -67,7 +67,7 @@ def read_experiment(out: Path) -> list[PolicyResult]:
 
 def _read_run(run: Path) -> PolicyResult:
     """What has been evaluated of a run so far."""
-    if not run.exists():
+    if not is_there(run):
         raise DataError(f"{run}: there is no such folder")
     read_trained(run)
     evaluations = read_evaluations(run)

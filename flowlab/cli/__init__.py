@@ -22,7 +22,7 @@ _COMMANDS = {
     "report": ("flowlab.cli.report:report", "Write a report of evaluations, beside the paper's numbers."),
     "grade": ("flowlab.cli.grade:grade", "Measure the error of estimated tracks against known ones."),
     "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
-    "validate": ("flowlab.cli.datasets:validate", "Check a dataset or a run for all that would spoil its use."),
+    "validate": ("flowlab.cli.datasets:validate", "Check a dataset, a run or an experiment."),
     "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording, a film or a PNG."),
     "export": ("flowlab.cli.datasets:export", "Write a dataset in another tool's layout."),
     "plugins": ("flowlab.cli.plugins:plugins", "List trackers, readers, stages, policies and more, and from where."),

@@ -8,6 +8,7 @@ import click
 
 from flowlab.cli.console import echo, print_json, print_tables, say
 from flowlab.cli.evaluate import echo_report, parse_seeds
+from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the experiment.")
+@click.option("--out", type=PATH, required=True, help="Folder of the experiment.")
 @click.option("--recipe", default="paper", show_default=True, help="An experiment's name, or a YAML file.")
 @click.option("--group", "groups", multiple=True, help="All tasks of a difficulty, instead of the recipe's tasks.")
 @click.option("--task", "tasks", multiple=True, help="A task, instead of the recipe's; may be repeated.")

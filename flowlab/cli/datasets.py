@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json, print_table
+from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.cli.paths import PATH
 from flowlab.errors import DataError
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset", type=PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def info(dataset: Path, as_json: bool) -> None:
     """Say what a dataset holds and how it was made."""
@@ -69,10 +70,10 @@ def _numbers(values: list[float]) -> str:
 
 
 @click.command()
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def validate(folder: Path, as_json: bool) -> None:
-    """Check a dataset or a training run: one line for each finding, exit code 3 if there is any."""
+    """Check a dataset, a training run or an experiment: one line for each finding, exit code 3 if there is any."""
     findings = []
     for finding in _findings_of(folder):
         findings.append(finding)
@@ -87,7 +88,11 @@ def validate(folder: Path, as_json: bool) -> None:
 
 
 def _findings_of(folder: Path) -> "Iterator[Finding]":
-    """What is wrong with a dataset or a run."""
+    """What is wrong with a dataset, a run or an experiment."""
+    if (folder / "units").is_dir():
+        from flowlab.benchmark.validation import validate_experiment
+
+        return validate_experiment(folder)
     if any((folder / name).exists() for name in ("policy.json", "run.json")):
         from flowlab.evaluation.validation import validate_run
 
@@ -107,9 +112,9 @@ def _reservation(folder: Path) -> str:
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset", type=PATH)
 @click.option("--to", "exporter", required=True, metavar="NAME", help="Which tool: dp3, or one of a plug-in.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Where to write.")
+@click.option("--out", type=PATH, required=True, help="Where to write.")
 @click.option("--task", help="Only this task's episodes.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change an option of the exporter.")
 def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...]) -> None:
@@ -121,5 +126,8 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     from flowlab.storage.dataset import Dataset
     from flowlab.storage.exporters.base import make_exporter
 
-    count = make_exporter(exporter, settings).export(Dataset(dataset), out, task)
+    data = Dataset(dataset)
+    count = make_exporter(exporter, settings).export(data, out, task)
+    if data.reservation:
+        say(f"flowlab: {data.reservation}")
     echo(f"{count} episodes written to {out} for {exporter}")

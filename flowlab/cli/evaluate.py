@@ -6,11 +6,12 @@ from pathlib import Path
 import click
 
 from flowlab.cli.console import ProgressBar, echo, print_json, print_tables
+from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
 
 
 @click.command("eval")
-@click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path(path_type=Path))
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=PATH)
 @click.option("--episodes", type=click.IntRange(min=1), default=20, show_default=True, help="Of each task and seed.")
 @click.option("--seeds", default="0,1,2", show_default=True, metavar="N,...", help="Evaluation seeds.")
 @click.option("--task", "tasks", multiple=True, help="May be repeated  [all that every policy was trained on].")
@@ -20,9 +21,9 @@ from flowlab.errors import UsageError
 @click.option("--workers", type=click.IntRange(min=1), help="Processes  [one for each core].")
 @click.option("--device", default="cpu", show_default=True, help="Where plans are made: cpu, cuda, cuda:1.")
 @click.option("--films", type=click.IntRange(min=0), default=0, metavar="N", help="Film N successes and N failures.")
-@click.option("--out", type=click.Path(path_type=Path), help="Write a report into this folder.")
+@click.option("--out", type=PATH, help="Write a report into this folder.")
 @click.option("--offline", is_flag=True, help="No simulator: errors on held-out demonstrations.")
-@click.option("--data", type=click.Path(path_type=Path), help="With --offline: another dataset than the run's own.")
+@click.option("--data", type=PATH, help="With --offline: another dataset than the run's own.")
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON, and no progress.")
 def evaluate(
     runs: tuple[Path, ...],

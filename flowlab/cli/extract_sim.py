@@ -9,13 +9,14 @@ from typing import Any
 import click
 
 from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
+from flowlab.cli.paths import PATH
 
 
 @click.command("extract-sim")
 @click.argument("tasks", nargs=-1, metavar="[TASK]...")
 @click.option("--group", "groups", multiple=True, help="All tasks of a difficulty: easy, medium, hard, very-hard, all.")
 @click.option("--episodes", type=click.IntRange(min=1), help="Successful episodes per task [the recipe's: 10].")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the dataset.")
+@click.option("--out", type=PATH, required=True, help="Folder of the dataset.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
 @click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
 @click.option("--recipe", default="metaworld", show_default=True, help="A recipe's name, or a YAML file.")

@@ -8,6 +8,7 @@ import click
 from pydantic import ValidationError
 
 from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("recordings", nargs=-1, metavar="[RECORDING]...", type=click.Path(path_type=Path))
+@click.argument("recordings", nargs=-1, metavar="[RECORDING]...", type=PATH)
 @click.option("--tracker", "names", multiple=True, default=["rigid-bodies"], show_default=True, help="May be repeated.")
 @click.option("--tasks", default="", metavar="TASK,...", help="Simulate recordings of these tasks.")
 @click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="Recordings of each task.")
@@ -25,12 +26,10 @@ if TYPE_CHECKING:
 @click.option("--sensor", type=click.Choice(["kinect", "clean"]), default="kinect", show_default=True)
 @click.option("--size", default="320x240", show_default=True, metavar="WxH", help="Of simulated pictures [px].")
 @click.option("--set", "changes", multiple=True, metavar="[TRACKER.]KEY=VALUE", help="Change a tracker's option.")
-@click.option("--weights", type=click.Path(path_type=Path), help="File of a learned tracker's weights.")
+@click.option("--weights", type=PATH, help="File of a learned tracker's weights.")
 @click.option("--chunk", type=click.IntRange(min=2), help="Frames tracked at a time.")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("grade"), show_default=True, help="Folder to write."
-)
+@click.option("--out", type=PATH, default=Path("grade"), show_default=True, help="Folder to write.")
 @click.option("--json", "as_json", is_flag=True, help="Print the grades as JSON, and no progress.")
 def grade(
     recordings: tuple[Path, ...],

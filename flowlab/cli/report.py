@@ -6,12 +6,13 @@ import click
 
 from flowlab.cli.console import print_json, print_tables
 from flowlab.cli.evaluate import echo_report
+from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
 
 
 @click.command()
-@click.argument("sources", nargs=-1, required=True, metavar="SOURCE...", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Folder to write  [SOURCE, if it is an experiment].")
+@click.argument("sources", nargs=-1, required=True, metavar="SOURCE...", type=PATH)
+@click.option("--out", type=PATH, help="Folder to write  [SOURCE, if it is an experiment].")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def report(sources: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     """Write a report of evaluations: report.html, report.json, CSV.

@@ -9,19 +9,20 @@ from typing import Any
 import click
 
 from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
+from flowlab.cli.paths import PATH
 from flowlab.errors import DataError, UsageError
 
 
 @click.command("track-real")
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the dataset; not needed for --dry-run.")
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
+@click.option("--out", type=PATH, help="Folder of the dataset; not needed for --dry-run.")
 @click.option("--task", help="Task of all these recordings [what they say, or the name of their folder].")
 @click.option("--tracker", help="Short for --set track.tracker=NAME [the recipe's: rigid-bodies].")
 @click.option("--chunk", type=click.IntRange(min=1), help="Frames to a chunk [the recipe's: 33].")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next [the recipe's: 8].")
-@click.option("--weights", type=click.Path(path_type=Path), help="File with a learned tracker's weights.")
+@click.option("--weights", type=PATH, help="File with a learned tracker's weights.")
 @click.option("--reader", help="Short for --set recording.reader=NAME [the one that recognizes the recording].")
-@click.option("--calibration", type=click.Path(path_type=Path), help="YAML file with calibration for all of them.")
+@click.option("--calibration", type=PATH, help="YAML file with calibration for all of them.")
 @click.option("--recipe", default="real", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")

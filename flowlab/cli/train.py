@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from flowlab.cli.console import STEPS_LINE, ProgressBar, echo, print_json, print_table, say, show_training
+from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
@@ -31,15 +32,15 @@ class PluginOption(click.Option):
 
 
 @click.command()
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=PATH)
 @click.option("--policy", cls=PluginOption, registry=POLICIES, help="What to train.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the run.")
+@click.option("--out", type=PATH, help="Folder of the run.")
 @click.option("--profile", help="fast, paper, or a YAML file with the settings that differ  [fast].")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Train as long as this; see --help's end.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: motion.points=50.")
 @click.option("--seed", type=click.IntRange(min=0), help="Short for --set run.seed=...")
 @click.option("--overfit", type=click.IntRange(min=1), metavar="N", help="Train on N demonstrations, and test on them.")
-@click.option("--from", "began_from", type=click.Path(path_type=Path), help="Begin with the weights of this run.")
+@click.option("--from", "began_from", type=PATH, help="Begin with the weights of this run.")
 @click.option("--resume", is_flag=True, help="Go on with the run that SOURCE is.")
 @click.option("--device", help="cpu, cuda or cuda:1  [a GPU if there is one].")
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads of each process  [1].")

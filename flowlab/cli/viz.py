@@ -5,10 +5,11 @@ from pathlib import Path
 import click
 
 from flowlab.cli.console import echo
+from flowlab.cli.paths import PATH
 
 
 @click.command()
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=PATH)
 @click.option(
     "--episode",
     default=0,
@@ -18,9 +19,9 @@ from flowlab.cli.console import echo
 @click.option("--task", help="Count episodes within this task; of a RUN, the task to try.")
 @click.option("--seed", type=click.IntRange(min=0), help="Of a RUN: evaluation seed  [0].")
 @click.option("--rejects", is_flag=True, help="Count among what was kept out of the dataset, and say why it was.")
-@click.option("--save", type=click.Path(path_type=Path), help="Write a Rerun recording (.rrd) here.")
-@click.option("--png", type=click.Path(path_type=Path), help="Draw a still here.")
-@click.option("--mp4", type=click.Path(path_type=Path), help="Write a film of the pictures here, tracks drawn in.")
+@click.option("--save", type=PATH, help="Write a Rerun recording (.rrd) here.")
+@click.option("--png", type=PATH, help="Draw a still here.")
+@click.option("--mp4", type=PATH, help="Write a film of the pictures here, tracks drawn in.")
 @click.option("--fps", type=click.FloatRange(min=0.1, max=240), help="Frames a second of the film [real time].")
 def viz(
     source: Path,

@@ -4,9 +4,12 @@ They lie in the user's cache folder, and never in that of a dataset, which someb
 was decoded here, from episodes whose digests were checked, and is what it was when it was written.
 """
 
+import atexit
+import functools
 import logging
 import os
 import shutil
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -59,9 +62,10 @@ class CacheIndex(Settings):
 
 
 def cached_part(source: TrainingSource, fallback: Path | None, part: str, arrays_of: ArraysOf) -> Path:
-    """A part of a dataset, decoded into the user's cache folder, or into ``fallback/cache`` where that is unwritable.
+    """A part of a dataset, decoded into the user's cache folder, or below ``fallback/cache`` where that is unwritable.
 
-    What is there already is looked over: what is damaged is decoded anew, which a warning says.
+    What is there already is looked over: what is damaged is decoded anew, which a warning says. Below ``fallback``,
+    which somebody else may have made, nothing is believed but what this process decoded.
 
     Args:
         source: The dataset or store.
@@ -76,6 +80,8 @@ def cached_part(source: TrainingSource, fallback: Path | None, part: str, arrays
         DataError: No folder can be written, or the episodes are of different widths.
     """
     content = f"{source.cache_key}-{_FORMAT}"
+    if fallback is not None:
+        remove_leftovers(fallback / "cache")
     problems: list[str] = []
     for cache in _places(fallback, problems):
         try:
@@ -116,7 +122,20 @@ def _places(fallback: Path | None, problems: list[str]) -> Iterator[Path]:
     if (fallback / "cache").is_symlink():  # of a stranger's run it could lead anywhere
         problems.append(f"{fallback / 'cache'}: is a link, expected a folder")
         return
-    yield fallback / "cache"
+    try:
+        yield _of_this_process(fallback / "cache")
+    except OSError as error:
+        problems.append(f"{fallback / 'cache'}: cannot be written ({error.strerror or error})")
+
+
+@functools.cache
+def _of_this_process(folder: Path) -> Path:
+    """A new folder in one where a stranger may have put things, for as long as this process runs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(folder)
+    mine = Path(tempfile.mkdtemp(prefix=temporary_path(folder / "decoded-").name, dir=folder))
+    atexit.register(shutil.rmtree, mine, ignore_errors=True)
+    return mine
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """What can be trained on: a flowlab dataset, or a store in DP3's layout."""
 
 import hashlib
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
 from flowlab.storage.trainable import training_problems
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,8 @@ def source_of(dataset: Dataset) -> TrainingSource:
         )
     if problem := next(training_problems(dataset), ""):
         raise DataError(f"{dataset.path}: {problem}")
+    if dataset.reservation:
+        _LOG.warning("flowlab: %s", dataset.reservation)
     frames = sum(ref.frames for ref in dataset.refs)
     return TrainingSource(
         dataset.path,

@@ -14,6 +14,7 @@ from flowlab.policies.checkpoint import RUN, LoadedPolicy, TrainedPolicy, check_
 from flowlab.policies.run_folder import RunConfig, read_run_config
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.shard import Shard
+from flowlab.untrusted import is_there
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ def _open_source(loaded: LoadedPolicy, run: Path, data: Path | None) -> Training
     if data is not None:
         return open_training_source(data)
     path = _read_plan(run).dataset
-    if not path.exists():
+    if not is_there(path):
         raise DataError(f"{run}: its dataset is no longer at {path}; give where it is now with --data")
     source = open_training_source(path)
     if source.fingerprint != loaded.trained.fingerprint:

@@ -11,10 +11,10 @@ from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
 from flowlab.policies.checkpoint import CHECKPOINTS, POLICY, RUN, build_policy, load_policy, read_trained
-from flowlab.policies.run_folder import RESUME, has_begun, read_resume, read_run_config
-from flowlab.storage.validation import Finding
+from flowlab.policies.run_folder import RESUME, has_begun, lines_behind, read_resume, read_run_config
+from flowlab.storage.validation import Finding, finding_of
 from flowlab.training.metrics import METRICS
-from flowlab.untrusted import read_json
+from flowlab.untrusted import is_there, read_json
 from flowlab.viz.training_metrics import metrics_lines
 
 
@@ -37,8 +37,7 @@ def validate_run(path: Path) -> Iterator[Finding]:
         try:
             check()
         except DataError as error:
-            place, separator, problem = str(error).partition(": ")
-            finding = Finding(place, problem) if separator else Finding(str(path), place)
+            finding = finding_of(path, error)
             if finding not in seen:  # what is wrong with policy.json, all that is read with it meets
                 seen.add(finding)
                 yield finding
@@ -53,7 +52,7 @@ def _check_begun(path: Path) -> None:
 def _check_plan(path: Path) -> None:
     """The plan, and the dataset that it is about."""
     planned, trained = read_run_config(path), read_trained(path)
-    if not planned.dataset.exists():
+    if not is_there(planned.dataset):
         raise DataError(f"{path / RUN}: dataset: {planned.dataset} is not there; restore it, or change where it is")
     if (found := open_training_source(planned.dataset).fingerprint) != trained.fingerprint:
         raise DataError(
@@ -89,6 +88,9 @@ def _check_finite(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 def _check_metrics(path: Path) -> None:
     steps = [line.step for line in metrics_lines(path / METRICS)]
+    step, groups = read_resume(path) if (path / RESUME).exists() else (0, {})
+    if (found := sum(s <= step for s in steps)) < (known := lines_behind(groups)):
+        raise DataError(f"{path / METRICS}: has {found} of {known} lines up to step {step}; restore it")
     if steps != sorted(steps):
         raise DataError(f"{path / METRICS}: its steps do not rise; restore it")
 

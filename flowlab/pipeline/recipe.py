@@ -13,6 +13,7 @@ from flowlab.config import Settings, explain, override, read_named, set_value
 from flowlab.errors import UsageError
 from flowlab.pipeline.stage import Pipeline, Stage
 from flowlab.registry import STAGES, names_from_file
+from flowlab.text import shown
 from flowlab.untrusted import parse_yaml
 
 _EXAMPLE = "observer.points=512"
@@ -112,7 +113,7 @@ def parse_recipe(text: str, origin: str, overrides: Iterable[str] = (), folder: 
 
 def _make_stage(values: Any, folder: Path | None) -> Stage:
     if not isinstance(values, Mapping) or not isinstance(values.get("stage"), str):
-        raise UsageError(f"every stage needs a name, as in 'stage: observer'; found {values!r}")
+        raise UsageError(f"every stage needs a name, as in 'stage: observer'; found {shown(values)}")
     name = values["stage"]
     cls = STAGES.load(name, folder)
     try:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -96,8 +97,14 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
     tensors, step = read_run_tensors(weights, folder, _ADVICE)
+    if re.fullmatch(r"step-\d{8}\.safetensors", weights.name) and weights.name != _checkpoint_name(step):
+        raise DataError(f"{weights}: holds the weights after {step} steps; restore it, or call it after them")
     policy = build_policy(trained.policy, tensors, f"{weights}: does not fit {folder / POLICY}")
     return LoadedPolicy(policy.requires_grad_(False).eval().to(device), trained, step, weights)
+
+
+def _checkpoint_name(step: int) -> str:
+    return f"step-{step:08d}.safetensors"
 
 
 def build_policy(spec: PolicySpec, tensors: Mapping[str, Tensor], misfit: str) -> PolicyNetwork:
@@ -172,7 +179,7 @@ def check_observer(trained: TrainedPolicy, where: Path, source: TrainingSource) 
 
 def save_weights(folder: Path, policy: PolicyNetwork, step: int) -> Path:
     """Keep the weights of a policy as a checkpoint of a run."""
-    path = folder / CHECKPOINTS / f"step-{step:08d}.safetensors"
+    path = folder / CHECKPOINTS / _checkpoint_name(step)
     with writing_run(folder):
         check_inside(folder, path.parent)
         path.parent.mkdir(exist_ok=True)

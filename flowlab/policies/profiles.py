@@ -10,6 +10,7 @@ from flowlab.config import Settings, explain, merge, override, read_named
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.registry import POLICIES
+from flowlab.text import shown
 from flowlab.untrusted import parse_yaml
 
 _EXTENDS, _POLICIES = "extends", "policies"
@@ -117,5 +118,5 @@ def _part_of(policy: str, by_policy: Any, origin: str) -> dict[str, Any]:
 def _beside(profile: str, parent: Any) -> str:
     """The profile that another extends: by its name, or a file whose path is relative to the other's folder."""
     if not isinstance(parent, str):
-        raise UsageError(f"profile {profile}: extends: must be the name of a profile or a file; found {parent!r}")
+        raise UsageError(f"profile {profile}: extends: must be the name of a profile or a file; found {shown(parent)}")
     return str(Path(profile).parent / parent) if Path(parent).suffix else parent

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from flowlab.checksums import with_checksum
@@ -73,6 +74,11 @@ def read_resume(folder: Path) -> tuple[int, Groups]:
         group, _, rest = name.partition(":")
         groups.setdefault(group, {})[rest] = value
     return step, groups
+
+
+def lines_behind(groups: Groups) -> int:
+    """How many lines of metrics there were when a resume file was written; 0 where it does not tell."""
+    return int(groups.get("metrics", {}).get("lines", torch.tensor(0)))
 
 
 def has_begun(folder: Path) -> bool:

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from flowlab.checksums import sha256_of
 from flowlab.errors import DataError, MissingFileError
 from flowlab.files import locked, remove_leftovers, write_atomically
 from flowlab.provenance import Provenance
@@ -21,6 +22,8 @@ from flowlab.storage.receipts import check_widths, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.storage.shard import Shard
+from flowlab.text import cut
+from flowlab.untrusted import is_there
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +63,7 @@ class Dataset(EpisodeSequence):
 
     def __init__(self, path: Path | str) -> None:
         self._path = Path(path)
-        if not self.path.exists():
+        if not is_there(self.path):
             raise MissingFileError(f"{self.path}: there is no such folder")
         self.manifest = Manifest.read(self.path)
         self.receipts = read_receipts(self.path)
@@ -143,6 +146,11 @@ class Dataset(EpisodeSequence):
                 f"{self.path}: {ref.task} seed {ref.seed} was rejected at {ref.stage} ({ref.reason}), "
                 "before there was an episode to look at"
             )
+        checksum = next(r.rejects_sha256 for r in self.receipts if r.rejects_shard == ref.shard)
+        if checksum and is_there(self.path / ref.shard) and sha256_of(self.path / ref.shard) != checksum:
+            raise DataError(
+                f"{self.path / ref.shard}: damaged (its content does not match the checksum in its receipt)"
+            )
         return Shard(self.path / ref.shard).episode(ref.position)
 
     @cached_property
@@ -176,6 +184,13 @@ class Dataset(EpisodeSequence):
         for r in self.receipts:
             have[r.task] = have.get(r.task, 0) + len(r.accepted)
         return {t: n - have.get(t, 0) for t, n in self.manifest.requested.items() if have.get(t, 0) < n}
+
+    @property
+    def reservation(self) -> str:
+        """That it is not complete, for those who use what there is of it; empty where it is."""
+        missing = ", ".join(f"{n} of {task}" for task, n in self.missing.items())
+        what = "recordings" if self.manifest.recordings else "episodes"
+        return f"{self.path}: {what} are still to be made: {cut(missing)}; what there is, is used" if missing else ""
 
 
 def begin(folder: Path, manifest: Manifest) -> Manifest:

@@ -12,6 +12,7 @@ from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
 from flowlab.storage.receipts import Receipt
 from flowlab.storage.shard import REPAIR, Shard, episode_digest
+from flowlab.text import shown
 
 _TASKS_SHOWN = 6
 
@@ -38,12 +39,12 @@ def unit_refs(receipt: Receipt) -> list[EpisodeRef]:
 
 
 def unit_shard(folder: Path, receipt: Receipt) -> Shard:
-    """The shard of a unit. Raises :class:`DataError` where it holds more or fewer episodes than its receipt says."""
+    """The shard of a unit. Raises :class:`DataError` where it holds other episodes than its receipt says."""
     shard = Shard(folder / receipt.shard)
-    if len(shard) != len(receipt.accepted):
-        raise DataError(
-            f"{shard.path}: holds {len(shard)} episodes, its receipt says {len(receipt.accepted)}; {REPAIR}"
-        )
+    held = [(int(s), r.stop - r.start) for s, r in zip(shard.array("meta/seed"), shard.rows(), strict=False)]
+    told = list(zip(receipt.accepted, receipt.frames, strict=True))
+    if held != told:
+        raise DataError(f"{shard.path}: holds (seed, frames) {shown(held)}, its receipt says {shown(told)}; {REPAIR}")
     return shard
 
 

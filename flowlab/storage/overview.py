@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from flowlab.storage.dataset import Dataset
+from flowlab.storage.episodes import unit_shard
 from flowlab.storage.receipts import StageTally
-from flowlab.storage.shard import Shard
 from flowlab.storage.shard_arrays import StoredArray
 
 
@@ -58,7 +58,8 @@ class DatasetOverview:
 
 def dataset_overview(dataset: Dataset) -> DatasetOverview:
     """A dataset in totals. Raises :class:`DataError` where its first shard is missing or damaged."""
-    arrays = Shard(dataset.path / dataset.refs[0].shard).describe() if dataset.refs else []
+    first = next((r for r in dataset.receipts if dataset.refs and r.shard == dataset.refs[0].shard), None)
+    arrays = unit_shard(dataset.path, first).describe() if first is not None else []
     size = sum(f.stat().st_size for f in dataset.path.rglob("*") if f.is_file())
     return DatasetOverview(
         episodes=len(dataset),
@@ -104,8 +105,9 @@ def left_out_frames(dataset: Dataset) -> tuple[LeftOutFrame, ...]:
     source = {(r.task, r.seed): r.source for r in dataset.manifest.recordings}
     if not source:
         return ()
-    return tuple(
-        LeftOutFrame(source.get((ref.task, ref.seed), ""), name, reason)
-        for ref in dataset.refs
-        for name, reason in Shard(dataset.path / ref.shard).about(ref.position).get("bad_frames", ())
-    )
+    told: dict[tuple[str, int], list[tuple[str, str]]] = {}
+    for receipt in dataset.receipts:
+        shard = unit_shard(dataset.path, receipt) if receipt.accepted else None
+        for k, seed in enumerate(receipt.accepted):
+            told[receipt.task, seed] = shard.about(k).get("bad_frames", []) if shard is not None else []
+    return tuple(LeftOutFrame(source.get(key, ""), name, reason) for key in sorted(told) for name, reason in told[key])

@@ -1,13 +1,15 @@
 """The files that a shard consists of, in one stored zip, or in the folder that it was until schema version 2."""
 
+import stat
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from flowlab.errors import DataError, first_line
 from flowlab.limits import MAX_ARRAY_BYTES, MAX_LOADED_BYTES
+from flowlab.text import is_path_inside, shown
 from flowlab.untrusted import check_regular, read_bytes
 
 SUFFIX = ".zarr.zip"
@@ -41,8 +43,8 @@ class ZippedFiles(ShardFiles):
         except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
             raise DataError(f"{path}: not a readable shard ({first_line(error)})") from error
         self._members = {m.filename: m for m in self._zip.infolist()}
-        if len(self._members) != len(self._zip.infolist()):
-            raise DataError(f"{path}: damaged (two of its files have one name)")
+        if problem := _oddity(self._zip.infolist()):
+            raise DataError(f"{path}: damaged ({problem})")
 
     def __contains__(self, name: str) -> bool:
         return name in self._members
@@ -66,6 +68,20 @@ class ZippedFiles(ShardFiles):
             zlib.error,
         ) as error:
             raise DataError(f"{self.path}/{name}: damaged ({first_line(error)})") from error
+
+
+def _oddity(members: Sequence[zipfile.ZipInfo]) -> str:
+    """What a zip has that flowlab writes into none, so that other programs cannot read another shard in it."""
+    names = [m.filename for m in members]
+    if len({*names}) != len(names):
+        return "two of its files have one name"
+    if outside := [n for n in names if not is_path_inside(n)]:
+        return f"a file in it is called {shown(outside[0])}"
+    if linked := [m for m in members if stat.S_ISLNK(m.external_attr >> 16)]:
+        return f"{shown(linked[0].filename)} in it is a link"
+    if members and min(m.header_offset for m in members) != 0:
+        return "something stands before its first file"
+    return ""
 
 
 class FolderFiles(ShardFiles):

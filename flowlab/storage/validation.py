@@ -40,7 +40,7 @@ def validate(path: Path) -> Iterator[Finding]:
     try:
         dataset = Dataset(path)
     except DataError as error:
-        yield _finding(path, error)
+        yield finding_of(path, error)
         return
     yield from _check_books(dataset)
     seen: dict[tuple[str, int], str] = {}
@@ -72,14 +72,15 @@ def check_unit(dataset: Dataset, receipt: Receipt, *, contents: bool = True) -> 
     try:
         yield from _check_shard(dataset, receipt, Shard(place), contents)
     except DataError as error:
-        yield _finding(place, error)
+        yield finding_of(place, error)
 
 
 def _book(dataset: Dataset, receipt: Receipt) -> str:
     return f"{dataset.path}/receipts/{receipt.unit}.json counts it"
 
 
-def _finding(path: Path, error: DataError) -> Finding:
+def finding_of(path: Path, error: DataError) -> Finding:
+    """An error as a finding: the file that it begins with, or else ``path``."""
     place, separator, problem = str(error).partition(": ")
     return Finding(place, problem) if separator else Finding(str(path), place)
 
@@ -119,7 +120,7 @@ def _check_summaries(dataset: Dataset) -> Iterator[Finding]:
         try:
             found = read_text(place)
         except DataError as error:
-            yield _finding(place, error)
+            yield finding_of(place, error)
             continue
         if found != text:
             yield Finding(
@@ -140,7 +141,7 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard, contents: boo
             columns[spec.path] = shard.array(spec.path)
         except DataError as error:
             problems = True
-            yield _finding(shard.path, error)
+            yield finding_of(shard.path, error)
     ends = shard.array(EPISODE_ENDS)
     for problem in [] if problems else _shape_problems(dataset.manifest.provenance, columns, ends):
         problems = True

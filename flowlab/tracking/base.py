@@ -12,6 +12,7 @@ from flowlab.config import Settings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.records import Clip, Tracks2D
 from flowlab.registry import TRACKERS
+from flowlab.text import shown
 
 
 @runtime_checkable
@@ -72,5 +73,5 @@ def make_tracker(name: str, options: Mapping[str, Any] | None = None) -> Tracker
         option = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             raise UsageError(f"tracker '{name}': {unknown_name('option', option, cls.model_fields)}") from error
-        raise UsageError(f"tracker '{name}': {option}: {first['msg']} (found {first['input']!r})") from error
+        raise UsageError(f"tracker '{name}': {option}: {first['msg']} (found {shown(first['input'])})") from error
     return tracker

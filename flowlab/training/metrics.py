@@ -21,6 +21,7 @@ class MetricsFile:
         self.path = folder / METRICS
         self._logs = logs
         before = [line for line in metrics_lines(self.path) if line.step <= step] if step else []
+        self.lines = len(before)
         write_atomically(self.path, b"".join(line_of(_values(x.kind, x.step, x.values)) for x in before))
         spent = before[-1].values if before else {}
         self._began = time.process_time() - spent.get("cpu_s", 0.0), time.monotonic() - spent.get("wall_s", 0.0)
@@ -62,7 +63,7 @@ class RunningMeans:
 
     def pop_means(self) -> dict[str, float]:
         """The means since the last call."""
-        means = {name: total / max(self._count, 1) for name, total in self._sums.items()}
+        means = {name: self._sums[name] / max(self._count, 1) for name in sorted(self._sums)}  # a file knows no order
         self._sums, self._count = {}, 0
         return means
 

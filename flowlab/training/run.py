@@ -2,6 +2,7 @@
 
 import copy
 import json
+import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -38,9 +39,12 @@ from flowlab.training.loggers import check_loggers, make_logger
 from flowlab.training.metrics import MetricsFile
 from flowlab.training.precision import Precision
 from flowlab.training.trainer import Trainer, TrainingProgress
+from flowlab.untrusted import is_there
 
 _UNTIMED, _TIMED = 3, 12
 """Steps made to learn how long one takes."""
+
+_LOG = logging.getLogger(__name__)
 
 
 class ComputeSettings(Settings):
@@ -171,7 +175,7 @@ def resume_run(
     with names_from_file(but=logs or ()):
         check_loggers(config.logs)
     processes = ProcessGroup(config.device, config.threads, config.precision)
-    if not config.dataset.exists():
+    if not is_there(config.dataset):
         raise DataError(
             f"{folder}: its dataset is no longer at {config.dataset}; restore it, or change 'dataset' in {folder / RUN}"
         )
@@ -204,6 +208,10 @@ def run(
             remove_leftovers(trainer.folder)
             logs = [make_logger(log, trainer.folder, name, settings) for log in trainer.run.logs]
             metrics = MetricsFile(trainer.folder, trainer.step, logs)
+            if metrics.lines < trainer.lines:
+                lost = f"{trainer.lines - metrics.lines} of {trainer.lines} lines"
+                _LOG.warning("flowlab: %s: %s up to step %d are lost", metrics.path, lost, trainer.step)
+                trainer.lines = metrics.lines
     try:
         return trainer.fit(metrics, report if first else _silent, should_stop)
     finally:

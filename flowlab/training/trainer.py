@@ -15,7 +15,7 @@ from flowlab.errors import DataError, FlowlabError
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import TrainedPolicy, save_weights, writing_run
-from flowlab.policies.run_folder import Groups, RunConfig, save_resume, start_folder
+from flowlab.policies.run_folder import Groups, RunConfig, lines_behind, save_resume, start_folder
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.metrics import MetricsFile, RunningMeans
 from flowlab.training.optimizer import EMA, Optimizers
@@ -61,6 +61,8 @@ class Trainer:
         self._held_out = index_windows(buffer, list(run.held_out), settings.n_action_steps) if run.held_out else None
         self._means = RunningMeans()
         self.step = 0
+        self.lines = 0
+        """Of metrics, so far."""
 
     def train_step(self) -> dict[str, float]:
         """One step: the losses, averaged over all processes.
@@ -125,6 +127,7 @@ class Trainer:
         return validate(self.average.policy, self._builder, self._held_out, self.processes.device)
 
     def _log(self, metrics: MetricsFile | None, kind: str, values: dict[str, float]) -> None:
+        self.lines += 1
         if metrics is not None:
             with writing_run(self.folder):
                 metrics.write(kind, self.step, values)
@@ -154,6 +157,7 @@ class Trainer:
             "policy": self.policy.state_dict(),
             "average": self.average.policy.state_dict(),
             "optimizer": self.optimizers.state(),
+            "metrics": {"lines": torch.tensor(self.lines)},
             "means": {k: torch.tensor(v, dtype=torch.float64) for k, v in self._means.state().items()},
         }
 
@@ -166,6 +170,7 @@ class Trainer:
                 self.optimizers.load_state(groups["optimizer"])
         except (KeyError, RuntimeError) as error:
             raise DataError(f"{self.folder}: its resume file does not fit its policy.json; start anew") from error
+        self.lines = lines_behind(groups)
         self._means.load_state({name: float(value) for name, value in groups.get("means", {}).items()})
         self.step = step
 

@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ def main(seed: int, count: int, budget: float, only: tuple[str, ...], keep: Path
     warm_up()
     campaign = Campaign("attack", OUTCOMES, ("held",), keep)
     place = Workplace(campaign.folder)
-    chosen = [name for name in CASES if not only or name.startswith(only)]
+    chosen = [name for name in CASES if not only or any(fnmatchcase(name, asked) for asked in only)]
     for number in campaign.trials(0, min(count, len(chosen)), budget):
         name = chosen[(seed + number) % len(chosen)]
         needs, attack = CASES[name]
@@ -133,6 +134,8 @@ def _arena(top: Path, inputs: Path) -> Arena:
     for name in ("victim.txt", "victim.json", "photos/a.jpg"):
         (top / "outside" / name).write_text("dear to somebody")
     inputs.rename(top / "here")
+    for run in (top / "here").glob("*/run.json"):  # which tells where its dataset is
+        run.write_text(run.read_text().replace(str(inputs), str(top / "here")))
     return Arena(top, top / "here")
 
 

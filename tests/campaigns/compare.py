@@ -1,19 +1,18 @@
-"""What is the same in the results of two runs of a command: everything but times, memory and names of machines."""
+"""What is the same in the results of two runs of a command: all but measured times, memory and what shows them."""
 
 import hashlib
 import json
 import re
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-_OF_THE_MOMENT = re.compile(
-    r"^sha256$|(^|_)(s|ms|ms_per_frame|cpu|wall|time|seconds|memory_mb|peak|created|made|date|digest|digests|samples_per_s)$"
-)
-"""Keys whose values are of one run: how long it took, when it was, and digests over files that hold such."""
-_UNCOMPARED = re.compile(r"\.(rrd|log|lock)$|(^|/)training\.png$|(^|/)curve\.png$|(^|/)report\.(html|json|csv)$")
-"""Files that hold times, or that are drawn of them."""
+from flowlab.checksums import CHECKSUM, json_checksum
+
+_MEASURED = re.compile(r"^(cpu_s|wall_s|samples_per_s|ms_per_frame|peak_memory_mb)$")
+"""Keys whose values are of one run: how long it took, and how much memory."""
+_PICTURES_OF_TIMES = ("curve.png",)
+_RERUN = b"RRF2"
 
 
 def state(folder: Path, names: tuple[str, ...]) -> dict[str, str]:
@@ -24,8 +23,7 @@ def state(folder: Path, names: tuple[str, ...]) -> dict[str, str]:
         files = sorted(top.rglob("*")) if top.is_dir() else [top] if top.exists() else []
         for file in files:
             if not file.is_dir():
-                path = file.relative_to(folder).as_posix()
-                found[path] = "" if _UNCOMPARED.search(path) else _digest(file)
+                found[file.relative_to(folder).as_posix()] = _digest(file)
     return found
 
 
@@ -43,46 +41,39 @@ def leftovers(folder: Path) -> list[str]:
 
 def _digest(file: Path) -> str:
     content = file.read_bytes()
+    if file.name in _PICTURES_OF_TIMES:
+        return f"a picture of {content[:4]!r}{content[-8:]!r}"  # begun and ended
+    if file.suffix == ".rrd":  # holds the moment it was made
+        return f"a recording of {content[:4]!r}{_RERUN in content[-64:]}"
     if file.suffix in (".json", ".jsonl"):
-        content = _without_moments(content)
-    elif file.suffix == ".safetensors":
-        content = _tensors(content)
-    elif file.suffix == ".zip":
-        content = _members(file)
+        content = _without_measures(content)
     return hashlib.sha256(content).hexdigest()
 
 
-def _without_moments(content: bytes) -> bytes:
+def _without_measures(content: bytes) -> bytes:
+    """JSON, or lines of it, without what was measured; content that is none stays what it is."""
     try:
-        values = [json.loads(line) for line in content.splitlines() if line.strip()] if content[:1] == b"{" and (
-            content.count(b"\n") > 0 and content.splitlines()[0].rstrip().endswith(b"}")
-        ) else [json.loads(content)]  # fmt: skip
+        try:
+            documents = [json.loads(content)]
+        except ValueError:
+            documents = [json.loads(line) for line in content.splitlines()]
     except ValueError:
         return content
-    return json.dumps([_still(v) for v in values], sort_keys=True).encode()
+    if all(still(d) == d for d in documents):
+        return content
+    return json.dumps([_checked(d) for d in documents]).encode()  # the order of keys counts
 
 
-def _still(value: Any) -> Any:
+def _checked(document: Any) -> Any:
+    """A document without measures, and whether the checksum over both is right in place of it."""
+    values = still(document)
+    if isinstance(document, dict) and CHECKSUM in document:
+        values[CHECKSUM] = document[CHECKSUM] == json_checksum(document)
+    return values
+
+
+def still(value: Any) -> Any:
+    """Nested values without what was measured."""
     if isinstance(value, dict):
-        return {k: _still(v) for k, v in value.items() if not _OF_THE_MOMENT.search(k)}
-    return [_still(v) for v in value] if isinstance(value, list) else value
-
-
-def _tensors(content: bytes) -> bytes:
-    """The weights, without what the header says of the run."""
-    length = int.from_bytes(content[:8], "little")
-    try:
-        header = json.loads(content[8 : 8 + length])
-    except ValueError:
-        return content
-    header.pop("__metadata__", None)
-    return json.dumps(header, sort_keys=True).encode() + content[8 + length :]
-
-
-def _members(file: Path) -> bytes:
-    try:
-        with zipfile.ZipFile(file) as archive:
-            each = [(n, hashlib.sha256(archive.read(n)).hexdigest()) for n in sorted(archive.namelist())]
-    except (zipfile.BadZipFile, OSError, ValueError) as error:
-        return repr(error).encode() + file.read_bytes()
-    return json.dumps(each).encode()
+        return {k: still(v) for k, v in value.items() if not _MEASURED.search(k)}
+    return [still(v) for v in value] if isinstance(value, list) else value

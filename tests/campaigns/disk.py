@@ -95,7 +95,7 @@ def _judge(scene: Scene, folder: Path, known: Undisturbed, ended: Ended) -> tupl
     again = call(scene.command, folder)
     if again.code and scene.resumes and "--resume" in again.err:
         again = call(scene.resumes, folder)
-    if again.code and not (ended.code == 0 and "exists already" in again.err):
+    if again.code and not (scene.once and again.code == 3 and "exists already" in again.err):
         return "dead end", f"{ended.last_line} | then: {again.code} {again.err[-2000:]}"
     if changed := list(compare.differences(known.state, _final(scene, folder))):
         return "other bytes", f"{ended.last_line} | {changed[:5]}"

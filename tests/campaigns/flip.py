@@ -3,15 +3,15 @@
     python -m tests.campaigns.flip --seed 0 --count 2000
 
 One bit is flipped, the end cut off, 4 kB zeroed, the file swapped with another of its kind, or gone. Then everything
-that reads such a file is run. A damage is found when a command says so and ends with an exit code of 1 to 4, or says
-that it mends it; harmless when all results and every number shown are what they are without it. Anything else is a
-finding: a result that changed without a word, or a traceback.
+that reads such a file is run. Each command must say so, by an exit code of 1 to 4 and a sentence or by a warning, or
+its results and every number that it shows must be what they are without the damage. Anything else is a finding.
 """
 
+import json
 import random
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
@@ -19,10 +19,18 @@ import click
 from tests.campaigns import compare, faults
 from tests.campaigns.campaign import Campaign, options
 from tests.campaigns.engine import NAME as ENGINE
-from tests.campaigns.sandbox import HUNG, Ended, call, warm_up
+from tests.campaigns.sandbox import CACHE, HUNG, Ended, call, warm_up
 from tests.campaigns.scenes import SCENES, Workplace
 
 OUTCOMES = ("found", "harmless", "SILENT", "traceback", "hung")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A command that reads files, and what it makes of them."""
+
+    command: tuple[str, ...]
+    makes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -30,36 +38,43 @@ class Kind:
     """Files of one kind, and what reads them."""
 
     needs: tuple[str, ...]
-    files: str
-    """A glob from the trial's folder."""
-    readers: tuple[tuple[str, ...], ...]
-    makes: tuple[str, ...] = ()
-    """What readers make, which must be the same."""
+    files: tuple[str, ...]
+    """Globs from the trial's folder."""
+    readers: tuple[Reader, ...]
 
 
-_DATASET = (("validate", "data"), ("info", "data", "--json"), SCENES["train"].command, SCENES["export"].command)
-_REAL = (("validate", "real"), ("info", "real", "--json"), ("viz", "real", "--png", "a.png"))
-_REJECT = (("validate", "real"), ("info", "real", "--json"), ("viz", "real", "--rejects", "--png", "a.png"))
+def _of(scene: str, *more: str) -> Reader:
+    return Reader((*SCENES[scene].command, *more), SCENES[scene].makes)
+
+
+def _dataset(name: str, *more: Reader) -> tuple[Reader, ...]:
+    return Reader(("validate", name)), Reader(("info", name, "--json")), *more
+
+
+_DATASET = _dataset("data", _of("train"), _of("export"))
+_REAL = _dataset("real", Reader(("viz", "real", "--png", "a.png"), ("a.png",)))
+_REJECTED = _dataset("rejected", Reader(("viz", "rejected", "--rejects", "--png", "a.png"), ("a.png",)))
 _EVAL = ("eval", "run", "--episodes", "1", "--seeds", "0", "--engine", ENGINE, "--workers", "1", "--json")
-_RUN = (("validate", "run"), _EVAL, ("eval", "run", "--offline", "--json"))
-_TRIED = (("report", "tried", "--out", "report", "--json"),)
-_BENCH = (("report", "bench", "--json"), (*SCENES["bench"].command, "--json"))
+_RUN = (Reader(("validate", "run")), Reader(_EVAL), Reader(("eval", "run", "--offline", "--json")))
+_STOPPED = (Reader(("validate", "stopped")), _of("resume"))
+_TRIED = (Reader(("validate", "tried")), Reader(("report", "tried", "--out", "report", "--json"), ("report",)))
+_BENCH = (Reader(("validate", "bench")), Reader(("report", "bench", "--json")), _of("bench", "--json"))
 KINDS = {
-    "manifest": Kind(("data",), "data/flowlab.json", _DATASET, ("run", "store")),
-    "receipts": Kind(("data",), "data/receipts/*", _DATASET, ("run", "store")),
-    "shards": Kind(("data",), "data/shards/**/*", _DATASET, ("run", "store")),
-    "shards of recordings": Kind(("real",), "real/shards/**/*", _REAL, ("a.png",)),
-    "rejects": Kind(("real",), "real/rejects*/**/*", _REJECT, ("a.png",)),
-    "summaries": Kind(("data",), "data/[srR][teE][ajA][tD]*", _DATASET, ("run", "store")),
-    "cache": Kind(("cached",), "cached/cache/**/*", (("train", "cached", *SCENES["train"].command[2:]),), ("run",)),
-    "policy.json": Kind(("data", "run"), "run/policy.json", _RUN),
-    "run.json": Kind(("data", "run"), "run/run.json", _RUN),
-    "checkpoints": Kind(("data", "run"), "run/*/*.safetensors", _RUN),
-    "metrics": Kind(("data", "stopped"), "stopped/metrics.jsonl", (SCENES["resume"].command,), ("stopped",)),
-    "resume": Kind(("data", "stopped"), "stopped/resume*", (SCENES["resume"].command,), ("stopped",)),
-    "episodes": Kind(("data", "tried"), "tried/**/episodes*", _TRIED, ("report",)),
-    "experiment": Kind(("bench", "bench.yaml"), "bench/units/**/*", _BENCH),
-}  # fmt: skip
+    "manifest": Kind(("data",), ("data/flowlab.json",), _DATASET),
+    "receipts": Kind(("data",), ("data/receipts/*",), _DATASET),
+    "shards": Kind(("data",), ("data/shards/**/*",), _DATASET),
+    "shards of recordings": Kind(("real",), ("real/shards/**/*",), _REAL),
+    "rejects": Kind(("rejected",), ("rejected/rejects*", "rejected/rejects/**/*"), _REJECTED),
+    "summaries": Kind(("data",), ("data/stats.json", "data/rejects.jsonl", "data/README.md"), _DATASET),
+    "cache": Kind(("data", CACHE), (f"{CACHE}/**/*",), (_of("train"),)),
+    "policy.json": Kind(("data", "run"), ("run/policy.json",), _RUN),
+    "run.json": Kind(("data", "run"), ("run/run.json",), _RUN),
+    "checkpoints": Kind(("data", "run"), ("run/*/*.safetensors",), _RUN),
+    "metrics": Kind(("data", "stopped"), ("stopped/metrics.jsonl",), _STOPPED),
+    "resume": Kind(("data", "stopped"), ("stopped/resume*",), _STOPPED),
+    "episodes": Kind(("data", "tried"), ("tried/**/episodes*",), _TRIED),
+    "experiment": Kind(("bench", "bench.yaml"), ("bench/units/**/*",), _BENCH),
+}
 """Recordings are the user's own, and what they hold is not checked against anything. An exported store is for other
 tools: `export` promises that it is whole, and nothing of flowlab reads it but `train`, which checks its form."""
 
@@ -110,39 +125,48 @@ def main(seed: int, count: int, budget: float, only: tuple[str, ...], keep: Path
     campaign = Campaign("flip", OUTCOMES, ("found", "harmless"), keep)
     kinds = {name: KINDS[name] for name in only or KINDS}
     place = Workplace(campaign.folder)
-    known: dict[str, list[tuple[str, str]]] = {}
+    known: dict[str, list[Read]] = {}
     names = list(kinds)
     for number in campaign.trials(seed, count, budget):
         name = names[number % len(names)]
-        kind = kinds[name]
         if name not in known:
-            kind = kinds[name] = _readable(name, kind, place)
-            folder = place.trial(kind.needs)
-            known[name] = [(e.out, e.err) for e in _read(kind, folder)[0]]
-            known[name].append(("", repr(compare.state(folder, kind.makes))))
+            known[name] = list(_read(kinds[name], place.trial(kinds[name].needs)))
+            _check_readable(name, known[name])
         chance = random.Random(number)
-        folder = place.trial(kind.needs)
-        if (damage := _damage(kind, folder, chance)) is None:
-            continue
-        outcome, about = _judge(kind, folder, known[name])
+        folder = place.trial(kinds[name].needs)
+        damage = _damage(kinds[name], folder, chance)
+        outcome, about = _judge(_read(kinds[name], folder), known[name])
         campaign.add(name, outcome, f"seed {number}: {damage}: {about}", folder)
     campaign.finish()
 
 
-def _readable(name: str, kind: Kind, place: Workplace) -> Kind:
-    """The kind with those of its readers that can read undamaged files; which cannot is said."""
-    ended, _ = _read(kind, place.trial(kind.needs))
-    for command, of in zip(kind.readers, ended, strict=True):
-        if of.code:
-            click.echo(f"{name}: left out, since it reads none: flowlab {' '.join(command)}: {of.last_line}", err=True)
-    return replace(kind, readers=tuple(c for c, of in zip(kind.readers, ended, strict=True) if not of.code))
+@dataclass(frozen=True)
+class Read:
+    """What came of a reader."""
+
+    reader: Reader
+    ended: Ended
+    made: dict[str, str]
 
 
-def _damage(kind: Kind, folder: Path, chance: random.Random) -> str | None:
-    """Damage one file; None where there is none of the kind."""
-    files = sorted(p for p in folder.glob(kind.files) if p.is_file() and p.stat().st_size)
-    if not files:
-        return None
+def _read(kind: Kind, folder: Path) -> Iterator[Read]:
+    for reader in kind.readers:
+        ended = call(reader.command, folder)
+        yield Read(reader, ended, compare.state(folder, reader.makes))
+
+
+def _check_readable(name: str, reads: list[Read]) -> None:
+    """Every reader of a kind can read undamaged files, or it would find all damages."""
+    for read in reads:
+        if read.ended.code:
+            words = " ".join(read.reader.command)
+            raise click.ClickException(f"{name}: undamaged files fail: flowlab {words}: {read.ended.err[-2000:]}")
+
+
+def _damage(kind: Kind, folder: Path, chance: random.Random) -> str:
+    """Damage one file."""
+    found = {p for pattern in kind.files for p in folder.glob(pattern)}
+    files = sorted(p for p in found if p.is_file() and p.stat().st_size)
     file = chance.choice(files)
     others = [p for p in files if p != file and p.suffix == file.suffix and p.read_bytes() != file.read_bytes()]
     where = file.relative_to(folder)
@@ -151,41 +175,46 @@ def _damage(kind: Kind, folder: Path, chance: random.Random) -> str | None:
     return f"{where} {chance.choice(_DAMAGES)(file, chance)}"
 
 
-def _read(kind: Kind, folder: Path, stop: bool = False) -> tuple[list[Ended], bool]:
-    """Run what reads; with ``stop``, no further than the first that finds something."""
-    ended = []
-    for command in kind.readers:
-        ended.append(call(command, folder))
-        if stop and (ended[-1].code not in (0, 2) or ended[-1].traceback):
-            return ended, True
-    return ended, False
-
-
-def _judge(kind: Kind, folder: Path, known: list[tuple[str, str]]) -> tuple[str, str]:
-    ended, _ = _read(kind, folder, stop=True)
-    last = ended[-1]
-    if bad := next((e for e in ended if e.traceback), None):
-        return "traceback", bad.err[-2500:]
-    if last.code == HUNG:
-        return "hung", ""
-    if last.code not in (0, 2):
-        return "found", last.last_line
-    told = [e.last_line for e, (_, before) in zip(ended, known, strict=False) if _new_words(e.err, before)]
-    if told:
-        return "found", told[0]
-    changed = [k for k, (e, (out, _)) in enumerate(zip(ended, known, strict=False)) if _still(e.out) != _still(out)]
-    if changed:
-        return "SILENT", f"{' '.join(kind.readers[changed[0]])} says: {ended[changed[0]].out[:1500]}"
-    if repr(compare.state(folder, kind.makes)) != known[-1][1]:
-        return "SILENT", f"another result in {', '.join(kind.makes)}"
-    return "harmless", ""
-
-
-_NUMBERS_OF_THE_MOMENT = re.compile(r"\d[\d.,]* (s|s left|windows/s)\b|\"[a-z_]*(_s|ms|memory_mb|cpu|wall)\": [-\d.e]+")
+def _judge(reads: Iterator[Read], known: list[Read]) -> tuple[str, str]:
+    """Each reader by itself: that one finds a damage does not excuse another that is wrong in silence."""
+    told = ""
+    for read, before in zip(reads, known, strict=True):
+        ended, words = read.ended, " ".join(read.reader.command)
+        if ended.code == HUNG:
+            return "hung", words
+        if ended.traceback or not 0 <= ended.code <= 4 or (ended.code and not ended.err.strip()):
+            return "traceback", f"{words}: exit code {ended.code}: {ended.err[-2500:]}"
+        if ended.code or _new_words(ended.err, before.ended.err) or _is_missing(ended.out):
+            told = told or ended.last_line
+        elif _still(ended.out) != _still(before.ended.out):
+            return "SILENT", f"{words} says otherwise: {_first_difference(ended.out, before.ended.out)}"
+        elif changed := list(compare.differences(read.made, before.made)):
+            return "SILENT", f"{words} makes other {', '.join(changed[:5])}"
+    return ("found", told) if told else ("harmless", "")
 
 
 def _still(text: str) -> str:
-    return _NUMBERS_OF_THE_MOMENT.sub("", text)
+    """What a command prints, without what it measured."""
+    try:
+        values = compare.still(json.loads(text))
+        if isinstance(values, dict):
+            values.pop("megabytes", None)  # of whatever files there are
+        return json.dumps(values, indent=1)
+    except ValueError:
+        return re.sub(r"\d[\d.,]* (s|s left|windows/s)\b", "", text)
+
+
+def _is_missing(text: str) -> bool:
+    """Whether `info` says that episodes are missing."""
+    try:
+        return bool(json.loads(text).get("missing"))
+    except (ValueError, AttributeError):
+        return False
+
+
+def _first_difference(text: str, before: str) -> str:
+    lines = zip(_still(text).splitlines(), _still(before).splitlines(), strict=False)
+    return next((f"{x[:200]}, not {y[:200]}" for x, y in lines if x != y), "more or less of it")
 
 
 def _new_words(text: str, before: str) -> bool:

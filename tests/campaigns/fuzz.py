@@ -28,7 +28,7 @@ import click
 import cv2
 
 from flowlab.errors import FlowlabError
-from tests.campaigns.fuzz_kinds import KINDS, Kind, change
+from tests.campaigns.fuzz_kinds import KINDS, Kind, change, seal
 from tests.campaigns.watch import Watch
 
 _A_CHILD_DOES = 300
@@ -67,6 +67,8 @@ def prepare(kind: Kind, sample: Path, seed: int, index: int, folder: Path) -> ra
     (folder / _SENTINEL).write_text("raise SystemExit('code of the recording ran')\n")
     rng = case_rng(seed, kind.name, index)
     change(folder, kind.of, rng)
+    if kind.sealed and rng.random() < 0.5:
+        seal(folder)
     return rng
 
 

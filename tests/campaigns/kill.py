@@ -15,7 +15,7 @@ from pathlib import Path
 from tests.campaigns import compare, faults
 from tests.campaigns.campaign import Campaign, options
 from tests.campaigns.engine import NAME as ENGINE
-from tests.campaigns.sandbox import HUNG, Ended, call, warm_up
+from tests.campaigns.sandbox import HUNG, call, warm_up
 from tests.campaigns.scenes import SCENES, Scene, Workplace
 
 OUTCOMES = ("ok", "undisturbed", "lost", "silent", "dead end", "other bytes", "leftovers", "traceback")
@@ -90,7 +90,7 @@ def _judge(scene: Scene, folder: Path, known: Undisturbed, about: str) -> tuple[
     again = call(scene.command, folder)
     if again.code and scene.resumes and not again.traceback and "--resume" in again.err:
         again = call(scene.resumes, folder)
-    if not _ends_well(again):
+    if again.code and not (scene.once and again.code == 3 and "exists already" in again.err):
         kind = "traceback" if again.traceback else "dead end"
         return kind, f"{about}: the same command: {again.code} {again.err[-2000:]}"
     final = compare.state(folder, scene.makes)
@@ -102,11 +102,6 @@ def _judge(scene: Scene, folder: Path, known: Undisturbed, about: str) -> tuple[
     if stayed := compare.leftovers(folder):
         return "leftovers", f"{about}: {stayed[:5]}"
     return "ok", about
-
-
-def _ends_well(ended: Ended) -> bool:
-    exists = "exists already" in ended.err  # of an export that was killed after its last step
-    return ended.code == 0 or (ended.code == 3 and exists)
 
 
 def _without_leftovers(state: dict[str, str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import os
 import random
 import struct
@@ -12,6 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
+import numcodecs.zstd
 import numpy as np
 import yaml
 
@@ -65,6 +68,8 @@ def _form(content: bytes, name: str) -> Callable[[bytes, random.Random], bytes] 
         return _mutate_json
     if content.startswith(b"\x93NUMPY"):
         return _mutate_pickle if b"'|O'" in content[:128] else _mutate_npy
+    if "/c/" in name:
+        return _mutate_chunk
     if content.startswith(b"PK"):
         return _mutate_zip
     if content.startswith(b"\x89PNG"):
@@ -265,6 +270,8 @@ def _mutate_pickle(content: bytes, rng: random.Random) -> bytes:
 def _mutate_zip(content: bytes, rng: random.Random) -> bytes:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = {i.filename: archive.read(i) for i in archive.infolist()}
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        method = archive.infolist()[0].compress_type if rng.random() < 0.97 else zipfile.ZIP_DEFLATED
     name = rng.choice(list(members))
     how, made = rng.randrange(6), io.BytesIO()
     if how < 3:
@@ -277,10 +284,23 @@ def _mutate_zip(content: bytes, rng: random.Random) -> bytes:
         members[name] = bytes(rng.choice((0, 10, 1 << 20, 30 << 20)))
     else:
         del members[name]
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(made, "w", method) as archive:
         for key, value in members.items():
             archive.writestr(key, value)
     return made.getvalue()
+
+
+def _mutate_chunk(content: bytes, rng: random.Random) -> bytes:
+    """A chunk of a shard, whose checksum is right again."""
+    values = bytearray(numcodecs.zstd.decompress(content[:-4]))
+    if rng.random() < 0.5:
+        number = struct.pack("<f", rng.choice((math.nan, math.inf, -math.inf, 1e30, -1.0, 0.0)))
+        at = rng.randrange(max(1, len(values) // 4)) * 4
+        values[at : at + 4] = number
+    else:
+        values = bytearray(_mutate_bytes(bytes(values), rng))
+    payload = numcodecs.zstd.compress(bytes(values), 1)
+    return payload + google_crc32c.value(payload).to_bytes(4, "little")
 
 
 def _mutate_png(content: bytes, rng: random.Random) -> bytes:

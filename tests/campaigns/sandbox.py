@@ -1,7 +1,9 @@
 """Commands run in a forked child of a program that has imported everything: a trial takes a fraction of a second."""
 
+import atexit
 import ctypes
 import os
+import pkgutil
 import shutil
 import signal
 import sys
@@ -12,17 +14,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-_WARM = (
-    "torch", "zarr", "cv2", "mujoco", "metaworld", "matplotlib.figure", "av", "scipy.spatial", "safetensors.torch",
-    "flowlab.benchmark.experiment", "flowlab.benchmark.summary", "flowlab.cli.bench", "flowlab.cli.console",
-    "flowlab.cli.datasets", "flowlab.cli.evaluate", "flowlab.cli.extract_sim", "flowlab.cli.grade",
-    "flowlab.cli.report", "flowlab.cli.reports", "flowlab.cli.track_real", "flowlab.cli.train", "flowlab.cli.viz",
-    "flowlab.evaluation.rollout", "flowlab.grading.run", "flowlab.pipeline.extraction", "flowlab.pipeline.labeling",
-    "flowlab.pipeline.stages.observe", "flowlab.pipeline.stages.recording", "flowlab.pipeline.stages.simulation",
-    "flowlab.policies.dp3", "flowlab.recordings.readers.plain", "flowlab.report.write", "flowlab.storage.validation",
-    "flowlab.tracking.trackers.lucas_kanade", "flowlab.training.train", "tests.campaigns.engine",
-)  # fmt: skip
-"""Not Rerun and OpenCV's work, which begin threads: a fork would lose them."""
+_COLD = ("flowlab.viz.recording", "flowlab.viz.blueprint", "flowlab.report.videos", "flowlab.__main__")
+"""Modules that are imported by each trial itself: Rerun begins threads, and a fork would lose them."""
+_WARM = ("metaworld", "matplotlib.figure", "matplotlib.style", "av", "numba.core.typing.templates", "torch._dynamo",
+         "safetensors.torch", "tests.campaigns.engine")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,13 +42,23 @@ class Ended:
 
 
 HUNG = -1000
+CACHE = "user-cache"
+"""Folder beside a trial's inputs that stands for the user's cache."""
 _DIE_WITH_PARENT = 1
 
 
 def warm_up() -> None:
-    """Import what commands need, here, where it is shared by all that are forked."""
-    for name in _WARM:
-        import_module(name)
+    """Import all that commands need, here, where it is shared by all that are forked."""
+    import flowlab
+
+    for name in (*_WARM, *(m.name for m in pkgutil.walk_packages(flowlab.__path__, "flowlab."))):
+        if name not in _COLD:
+            import_module(name)
+    import numba
+    from PIL import Image
+
+    Image.init()
+    numba.njit(lambda x: x + 1)(1)  # which imports what compiles
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         raise RuntimeError(f"{threads} threads run, and a fork would lose them")
@@ -122,7 +127,7 @@ def _run(
             os.dup2(os.open(logs / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), handle)
         sys.stdout, sys.stderr = (os.fdopen(h, "w", buffering=1, encoding="utf-8", closefd=False) for h in (1, 2))
         os.chdir(folder)
-        os.environ.update(environment)
+        os.environ.update({"FLOWLAB_CACHE": str(folder / CACHE)} | dict(environment))
         from flowlab.cli import main
 
         try:
@@ -136,6 +141,7 @@ def _run(
 
             traceback.print_exc()
             code = 1
+        atexit._run_exitfuncs()
         sys.stdout.flush()
         sys.stderr.flush()
         if os.environ.get("FLOWLAB_FAULTS"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.campaigns.engine import NAME as ENGINE
-from tests.campaigns.sandbox import Ended, call
+from tests.campaigns.sandbox import CACHE, Ended, call
 
 _TESTS = Path(__file__).parents[1]
 _PROFILE = str(_TESTS / "profiles/small.yaml")
@@ -48,6 +48,8 @@ class Scene:
     """Datasets and runs to be validated after a kill."""
     resumes: tuple[str, ...] = ()
     """What a person may type instead, if the same command says so."""
+    once: bool = False
+    """Whether it refuses to replace what it made: whole, then, as the comparison with an undisturbed run sees."""
 
 
 _TRAIN = ("--policy", "dp3", "--out", "run", "--profile", _PROFILE, "--threads", "1", "--device", "cpu",
@@ -57,7 +59,7 @@ _EVAL = ("--episodes", "1", "--seeds", "0", *_LOCAL)
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene("extract", (), ("extract-sim", "drawer-open", "--episodes", "2", "--out", "data", *_LOCAL,
+        Scene("extract", (), ("extract-sim", "drawer-open", "--episodes", "3", "--out", "data", *_LOCAL,
                               *_options(*_SIM)), ("data",), ("data",)),
         Scene("track", ("rec",), ("track-real", "rec", "--out", "real", "--tracker", "lucas-kanade", *_LOCAL,
                                   *_options(*_REAL)), ("real",), ("real",)),
@@ -65,7 +67,7 @@ SCENES = {
         Scene("resume", ("data", "stopped"), ("train", "stopped", "--resume"), ("stopped",), ("stopped",)),
         Scene("eval", ("data", "run"), ("eval", "run", *_EVAL, "--out", "report"), ("run", "report"), ("run",)),
         Scene("bench", ("bench.yaml",), ("bench", "--recipe", "bench.yaml", "--out", "bench", *_LOCAL), ("bench",)),
-        Scene("export", ("data",), ("export", "data", "--to", "dp3", "--out", "store"), ("store",)),
+        Scene("export", ("data",), ("export", "data", "--to", "dp3", "--out", "store"), ("store",), once=True),
         Scene("viz", ("real",), ("viz", "real", "--png", "a.png", "--mp4", "a.mp4", "--save", "a.rrd"),
               ("a.png", "a.mp4", "a.rrd")),
         Scene("grade", ("slide",), ("grade", "slide", "--tracker", "lucas-kanade", "--out", "graded"), ("graded",)),
@@ -156,18 +158,28 @@ def _make_stopped(place: Workplace) -> None:
         nth = int(share * whole.operations)
         call(train.command, folder, before=lambda f=folder, n=nth: faults.arm(f, faults.KILL, n))  # type: ignore[misc]
         shutil.copytree(folder / "run", place.inputs / "stopped", dirs_exist_ok=True)
-        if call(("train", "run", "--resume"), folder).code == 0:
+        told = (folder / "run/metrics.jsonl").read_bytes() if (folder / "run/metrics.jsonl").exists() else b""
+        if told and call(("train", "run", "--resume"), folder).code == 0:
             return
         shutil.rmtree(place.inputs / "stopped")
     raise RuntimeError("no killed run could be resumed")
 
 
 def _make_cached(place: Workplace) -> None:
-    """A dataset that was trained on, with its decoded cache wherever that is now."""
+    """What was decoded of the dataset when it was trained on."""
     train = SCENES["train"]
     folder = place.trial(train.needs)
     succeed(train.command, folder)
-    shutil.copytree(folder / "data", place.inputs / "cached")
+    shutil.copytree(folder / CACHE, place.inputs / CACHE)
+
+
+def _make_rejected(place: Workplace) -> None:
+    """A dataset of recordings whose estimated tracks are too bad, and are kept to be looked at."""
+    track = SCENES["track"]
+    folder = place.trial(track.needs)
+    command = tuple(word.replace("max_median_sigma_m=9", "max_median_sigma_m=0.00000001") for word in track.command)
+    call(command, folder)
+    shutil.copytree(folder / "real", place.inputs / "rejected")
 
 
 _MAKERS: dict[str, Callable[[Workplace], None]] = {
@@ -180,6 +192,7 @@ _MAKERS: dict[str, Callable[[Workplace], None]] = {
     "tried": lambda place: place.make("eval", ("run", "tried")),
     "store": lambda place: place.make("export", ("store", "store")),
     "bench": lambda place: place.make("bench", ("bench", "bench")),
-    "cached": _make_cached,
+    CACHE: _make_cached,
+    "rejected": _make_rejected,
     "stopped": _make_stopped,
 }

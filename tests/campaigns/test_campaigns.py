@@ -12,7 +12,8 @@ _FEW = {
     "kill": ("--count", "4", "--only", "export", "--only", "grade"),
     "disk": ("--count", "4", "--only", "export", "--only", "grade"),
     "flip": ("--count", "4", "--only", "shards", "--only", "manifest"),
-    "attack": ("--count", "3", "--only", "task of a dataset: name 2", "--only", "links at temporary names: export"),
+    "attack": ("--only", "task of a dataset: name 2", "--only", "links at temporary names: export"),
+    "fuzz": ("--count", "40", "--kind", "dataset-new", "--kind", "recipe"),
 }
 
 

@@ -126,6 +126,24 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.parametrize("path", ["a" * 300, "a/" * 3000, "a\0b", "\ud800"], ids=ascii)
+@pytest.mark.parametrize(
+    "command",
+    [["info"], ["validate"], ["report"], ["viz"], ["train", "--resume"], ["eval"],
+     ["export", "--to", "dp3", "--out", "o"], ["extract-sim", "push", "--out"], ["track-real", "--dry-run"], ["grade"]],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_a_path_that_no_file_can_have_is_one_sentence(
+    command: list[str], path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, err = call_cli(capsys, *command, path)
+    assert code == 2
+    assert "cannot be looked for" in err
+    assert len(err) < 1000
+    assert not list(tmp_path.iterdir())
+
+
 def _fill(context: object) -> None:
     with context as temporary:  # type: ignore[attr-defined]
         (temporary / "a" if temporary.is_dir() else temporary).write_text("mine")

@@ -4,6 +4,7 @@ believed, read or written."""
 import json
 import resource
 import shutil
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -159,6 +160,24 @@ def test_where_the_cache_cannot_be_written_the_run_keeps_the_arrays(
     with pytest.raises(DataError, match="set FLOWLAB_CACHE to a folder"):
         Windows(tmp_path / "d", {"state": [0]})
     assert len(Windows(tmp_path / "d", {"state": [0]}, cache=tmp_path / "run")) == sum(map(len, episodes))
+
+
+def test_what_lies_in_a_strangers_run_is_never_taken_for_decoded(tmp_path: Path, cache: Path) -> None:
+    """Their checksums may be right: they are no signatures."""
+    episodes = make_episodes()
+    source = write(tmp_path / "d", episodes)
+    check(load_buffer(source, tmp_path / "unused"), episodes)
+    (tmp_path / "run").mkdir()
+    shutil.move(cache, tmp_path / "run/cache")
+    [index] = (tmp_path / "run/cache").glob("*/arrays/index.json")
+    state = np.load(index.parent / "state.npy")
+    np.save(index.parent / "state.npy", state + 1)
+    values = json.loads(index.read_text())
+    values["arrays"]["state"] = zlib.crc32((index.parent / "state.npy").read_bytes())
+    index.write_text(json.dumps(with_checksum(values)))
+    cache.parent.rmdir()
+    cache.parent.write_text("in the way")
+    check(load_buffer(source, tmp_path / "run"), episodes)
 
 
 def cut(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -244,6 +245,37 @@ def test_values_that_are_all_zero_are_stored_all_the_same(tmp_path: Path) -> Non
     (tmp_path / "unit.zarr/data/success/c/0").unlink()
     with pytest.raises(DataError, match="1 of 1 chunks missing"):
         Shard(tmp_path / "unit.zarr").episode(0)
+
+
+def _with_name(archive: zipfile.ZipFile, name: str, link: bool = False) -> None:
+    about = zipfile.ZipInfo(name)
+    about.external_attr = (0o120777 if link else 0o644) << 16
+    archive.writestr(about, "../../x")
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize(
+    ("name", "link", "told"),
+    [
+        ("../x", False, "called '../x'"),
+        ("data/../../x", False, "called 'data/../../x'"),
+        ("/abs", False, "called '/abs'"),
+        ("zarr.json", False, "two of its files have one name"),
+        ("data/elsewhere", True, "'data/elsewhere' in it is a link"),
+    ],
+)
+def test_a_zip_that_others_made_odd_is_one_sentence(zipped: Path, name: str, link: bool, told: str) -> None:
+    with zipfile.ZipFile(zipped, "a") as archive:
+        _with_name(archive, name, link)
+    with pytest.raises(DataError, match=re.escape(told)):
+        Shard(zipped)
+    assert [p.name for p in zipped.parent.iterdir()] == [zipped.name]
+
+
+def test_a_zip_with_something_before_it_is_one_sentence(zipped: Path) -> None:
+    zipped.write_bytes(b"#!/bin/sh\n" + zipped.read_bytes())
+    with pytest.raises(DataError, match="something stands before its first file"):
+        Shard(zipped)
 
 
 def test_writing_onto_a_shard_replaces_it(zipped: Path) -> None:

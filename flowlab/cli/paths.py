@@ -1,0 +1,28 @@
+"""Paths as they are typed."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from flowlab.text import shown
+
+
+class _Path(click.Path):
+    """A path that is text and that a file system can have, there or not; another is told before it is looked for."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            os.path.abspath(value).encode()  # whatever keeps a path, keeps it as text
+            os.lstat(value)
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        except (OSError, ValueError) as error:  # too long, a NUL or half a character in it, a folder that is locked
+            reason = getattr(error, "strerror", None) or "it is no text in UTF-8, or has a NUL; rename it"
+            self.fail(f"{shown(str(value))}: cannot be looked for ({reason})", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _Path(path_type=Path)
+"""The type of all arguments and options that are files or folders."""
