@@ -9,7 +9,7 @@ from typing import Any
 
 import safetensors
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from flowlab.checksums import with_checksum, without_checksum
@@ -26,7 +26,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     told = json.dumps(with_checksum({**about, "tensors": _digest(plain)}))
     with new_file(path) as temporary:
-        save_file(plain, temporary, {_ABOUT: told})  # under one key: several would come in any order
+        about_all = {_ABOUT: told}  # under one key: several would come in any order
+        temporary.write_bytes(save(plain, about_all))  # save_file has a temporary name of its own, which a kill leaves
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

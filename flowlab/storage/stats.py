@@ -23,13 +23,14 @@ _CHANNELS: dict[str, Callable[[Episode], np.ndarray | None]] = {
     "object_pose": lambda e: e.object_pose,
 }
 
-_Histogram = Annotated[list[int], Field(min_length=len(_BINS) - 1, max_length=len(_BINS) - 1)]
+_Count = Annotated[int, Field(ge=0, lt=1 << 53)]
+_Histogram = Annotated[list[_Count], Field(min_length=len(_BINS) - 1, max_length=len(_BINS) - 1)]
 
 
 class Moments(TypedDict):
     """Limits, mean and sum of squared deviations of every channel of an array."""
 
-    count: int
+    count: _Count
     min: list[float]
     max: list[float]
     mean: list[float]
@@ -41,16 +42,16 @@ class QualitySums(TypedDict):
 
     sigma: _Histogram
     sigma_visible: _Histogram
-    source: Annotated[list[int], Field(min_length=len(PositionSource), max_length=len(PositionSource))]
+    source: Annotated[list[_Count], Field(min_length=len(PositionSource), max_length=len(PositionSource))]
 
 
 class MergeableStats(TypedDict, total=False):
     """Mergeable statistics of some episodes, as JSON values; of none it is empty."""
 
-    episodes: int
-    frames: int
-    points: int
-    moving_points: int
+    episodes: _Count
+    frames: _Count
+    points: _Count
+    moving_points: _Count
     steps: _Histogram
     """Of the lengths of the points' steps [m]."""
     arrays: dict[str, Moments]

@@ -157,7 +157,7 @@ class Trainer:
             "policy": self.policy.state_dict(),
             "average": self.average.policy.state_dict(),
             "optimizer": self.optimizers.state(),
-            "metrics": {"lines": torch.tensor(self.lines)},
+            "metrics": {"lines": torch.tensor(self.lines, dtype=torch.float64)},
             "means": {k: torch.tensor(v, dtype=torch.float64) for k, v in self._means.state().items()},
         }
 

@@ -73,16 +73,17 @@ def _seal_tensors(file: Path) -> None:
     import safetensors
     from safetensors.torch import load_file
 
-    from flowlab.policies import checkpoint
+    from flowlab.policies.checkpoint import POLICY, RUN, identity_in
+    from flowlab.policies.tensor_files import write_tensors
 
     with safetensors.safe_open(file, "pt") as opened:
         about = json.loads(opened.metadata()["flowlab"])
     tensors = load_file(file)
-    run = file.parent if (file.parent / checkpoint.POLICY).exists() else file.parents[1]
-    for name, other in (("policy", checkpoint.POLICY), ("run", checkpoint.RUN)):
+    run = file.parent if (file.parent / POLICY).exists() else file.parents[1]
+    for name, other in (("policy", POLICY), ("run", RUN)):
         if name in about:
-            about[name] = checkpoint._identity_in(run / other)
-    checkpoint._write(file, tensors, {k: v for k, v in about.items() if k not in ("tensors", "sha256")})
+            about[name] = identity_in(run / other)
+    write_tensors(file, tensors, {k: v for k, v in about.items() if k not in ("tensors", "sha256")})
 
 
 def command(*arguments: Any) -> None:

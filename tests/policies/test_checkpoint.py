@@ -182,6 +182,14 @@ def test_weights_of_another_shape_are_refused(run: Path, tmp_path: Path, capsys:
     assert err == f"flowlab: {tmp_path / 'run'}: {sentence}\n"
 
 
+def test_a_checkpoint_under_the_name_of_another_is_refused(run: Path, tmp_path: Path, capsys: Capture) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    *_, before, last = sorted((tmp_path / "run/checkpoints").iterdir())
+    shutil.copy(before, last)
+    with pytest.raises(DataError, match=f"{last.name}: holds the weights after {int(before.stem[5:])} steps"):
+        load_policy(tmp_path / "run")
+
+
 def rewrite(path: Path, values: dict[str, Any]) -> None:
     """Write a run's JSON with the digest of its content, as somebody might who means it."""
     path.write_text(json.dumps(with_checksum({k: v for k, v in values.items() if k != "sha256"})))

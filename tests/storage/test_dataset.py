@@ -399,6 +399,9 @@ def test_what_was_rejected_can_be_listed_and_looked_at(tmp_path: Path) -> None:
         "task": "roll", "seed": 3, "stage": "quality", "reason": "because 3", "source": "/rec/c", "position": 0,
     }  # fmt: skip
     assert lines[1] == {"task": "roll", "seed": 2, "stage": "recording", "reason": "because 2"}
+    write_shard(tmp_path / kept, poor[::-1], "")
+    with pytest.raises(DataError, match="rejects/roll-000000-000003.zarr.zip: damaged"):
+        dataset.rejected(0)
 
 
 def test_a_dataset_of_two_widths_is_told_in_a_sentence(tmp_path: Path) -> None:

@@ -348,3 +348,17 @@ def test_what_is_damaged_is_said_in_one_sentence(
     assert sentence in err
     assert err.count("\n") == 1
     assert files_below(run) == before
+
+
+@pytest.mark.parametrize("harm", ["gone", "cut"])
+def test_lines_of_metrics_that_are_lost_are_told(
+    harm: str, rolls: Path, tmp_path: Path, capsys: Capture, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = stopped(rolls, tmp_path / "run")
+    metrics = run / "metrics.jsonl"
+    lines = metrics.read_bytes().splitlines(keepends=True)
+    assert lines
+    metrics.unlink() if harm == "gone" else metrics.write_bytes(b"".join(lines)[:-30])
+    assert call_cli(capsys, "validate", run)[0] == 3
+    assert call_cli(capsys, "train", run, "--resume")[0] == 0
+    assert f"of {len(lines)} lines up to step" in caplog.text
