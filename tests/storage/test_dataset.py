@@ -400,7 +400,7 @@ def test_what_was_rejected_can_be_listed_and_looked_at(tmp_path: Path) -> None:
     }  # fmt: skip
     assert lines[1] == {"task": "roll", "seed": 2, "stage": "recording", "reason": "because 2"}
     write_shard(tmp_path / kept, poor[::-1], "")
-    with pytest.raises(DataError, match="rejects/roll-000000-000003.zarr.zip: damaged"):
+    with pytest.raises(DataError, match=r"rejects/roll-000000-000003\.zarr\.zip: damaged"):
         dataset.rejected(0)
 
 
