@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,8 +38,12 @@ _SINCE_1970 = 1e8
 """Numbers beyond this that rise are times since 1970, in whatever unit [s or less]."""
 
 
+Splitter = Callable[[str], list[str]]
+"""Cuts a line into its cells."""
+
+
 @dataclass(frozen=True, slots=True)
-class Table:
+class SampleTable:
     """Rows of numbers."""
 
     path: Path
@@ -73,7 +77,7 @@ class Columns:
     values: Float64[np.ndarray, "N D"]
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> SampleTable:
     """The table of a text file or a numpy array. Raises :class:`DataError` where it is none."""
     if path.suffix.lower() != ".npy":
         return parse_table(path, read_text(path))
@@ -83,10 +87,10 @@ def read_table(path: Path) -> Table:
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or not len(values):
         raise DataError(f"{path}: has the shape {cut(str(values.shape))}, expected (rows, numbers)")
-    return Table(path, (), values.astype(np.float64), integers=values.dtype.kind in "iu")
+    return SampleTable(path, (), values.astype(np.float64), integers=values.dtype.kind in "iu")
 
 
-def parse_table(path: Path, text: str) -> Table:
+def parse_table(path: Path, text: str) -> SampleTable:
     """The table of a text. Raises :class:`DataError` where it is none, or can be read in two ways."""
     lines = [(n, x.strip()) for n, x in enumerate(text.lstrip("\ufeff").splitlines(), 1) if x.strip()]
     first = next((k for k, (_, x) in enumerate(lines) if not _COMMENT.match(x)), len(lines))
@@ -105,7 +109,7 @@ def parse_table(path: Path, text: str) -> Table:
     return _numbers(path, names, cells)
 
 
-def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -> Table:
+def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -> SampleTable:
     """A table of cells; a column that never holds a number is one of text where it has a name."""
     width = len(names) or len(cells[0][1])
     text = {k for k in range(width if names else 0) if not any(len(c) > k and _is_number(c[k]) for _, c in cells)}
@@ -118,10 +122,10 @@ def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -
             raise DataError(f"{path}: line {n} is not {width} numbers: {shown(' '.join(row))}{comma}")
         rows.append([np.nan if k in text else float(x) for k, x in enumerate(row)])
     integers = all(x.lstrip("+-").isdecimal() for _, row in cells for x in row)
-    return Table(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text), integers)
+    return SampleTable(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text), integers)
 
 
-def _splitter(path: Path, lines: Sequence[str]):  # type: ignore[no-untyped-def]
+def _splitter(path: Path, lines: Sequence[str]) -> Splitter:
     """What splits lines into cells, by the sign that separates them."""
     sign = next((s for s in ";\t," if any(s in line for line in lines[:2])), None)
     if sign is None:
@@ -148,7 +152,7 @@ def _splitter(path: Path, lines: Sequence[str]):  # type: ignore[no-untyped-def]
     return lambda line: [x.replace(",", ".") if re.fullmatch(r"[+-]?\d*,\d+(?:[eE].*)?", x) else x for x in cells(line)]
 
 
-def _of_commas(path: Path, lines: Sequence[str], cells):  # type: ignore[no-untyped-def]
+def _of_commas(path: Path, lines: Sequence[str], cells: Splitter) -> Splitter:
     """What splits lines at commas, where these separate cells and nothing else; else they may be decimal ones."""
     numbers = [line for line in lines if line[:1] in "+-.0123456789"]
     both = [x for x in numbers if re.search(r"\d,\d", x) and re.search(r"\d,?[ \t]+[+-]?\.?\d", x)]
@@ -158,7 +162,9 @@ def _of_commas(path: Path, lines: Sequence[str], cells):  # type: ignore[no-unty
     return cells
 
 
-def find_columns(table: Table, name: str, chosen: Sequence[str] | None, color_s: np.ndarray, timed: bool) -> Columns:
+def find_columns(
+    table: SampleTable, name: str, chosen: Sequence[str] | None, color_s: np.ndarray, timed: bool
+) -> Columns:
     """The times of a table and the numbers that are the state, or the action.
 
     Args:
@@ -186,7 +192,7 @@ def find_columns(table: Table, name: str, chosen: Sequence[str] | None, color_s:
 
 
 def _check_meaning(
-    table: Table, name: str, rest: Sequence[int], times: Sequence[int], color_s: np.ndarray, timed: bool
+    table: SampleTable, name: str, rest: Sequence[int], times: Sequence[int], color_s: np.ndarray, timed: bool
 ) -> None:
     """Refuse columns that are no numbers of a robot, or may be none, with what to write."""
     doubtful = dict.fromkeys(times[1:], "is a time, too")
@@ -216,7 +222,7 @@ def _check_meaning(
     raise DataError(f"{table.path}: column {cut(called)} {why}; {cut(advice, 600)}")
 
 
-def _scale(table: Table, k: int) -> float | None:
+def _scale(table: SampleTable, k: int) -> float | None:
     """Seconds in the unit of a column of times; None where nothing says which it is."""
     base, unit = base_and_unit(table.names[k])
     rosbag = table.names[k].startswith("%") or base in ("fieldheaderstamp", "rosbagtimestamp")
@@ -240,7 +246,7 @@ def _rises(values: np.ndarray) -> bool:
     return bool(len(values) > 1 and (np.diff(values) > 0).all())
 
 
-def _is_clock(table: Table, color_s: np.ndarray) -> bool:
+def _is_clock(table: SampleTable, color_s: np.ndarray) -> bool:
     """Whether the first column of a table without names may be times."""
     first = table.values[:, 0]
     if table.values.shape[1] < 2 or len(first) < _LIKE_A_CLOCK or not _rises(first):
