@@ -126,8 +126,9 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     from flowlab.storage.dataset import Dataset
     from flowlab.storage.exporters.base import make_exporter
 
+    to = make_exporter(exporter, settings)
     data = Dataset(dataset)
-    count = make_exporter(exporter, settings).export(data, out, task)
+    count = to.export(data, out, task)
     if data.reservation:
         say(f"flowlab: {data.reservation}")
     echo(f"{count} episodes written to {out} for {exporter}")

@@ -1,6 +1,7 @@
 """The folder of a training run: how the run goes, and what resuming needs, beside the policy and its weights."""
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -78,7 +79,8 @@ def read_resume(folder: Path) -> tuple[int, Groups]:
 
 def lines_behind(groups: Groups) -> int:
     """How many lines of metrics there were when a resume file was written; 0 where it does not tell."""
-    return int(groups.get("metrics", {}).get("lines", torch.tensor(0)))
+    lines = float(groups.get("metrics", {}).get("lines", torch.tensor(0)))
+    return int(lines) if math.isfinite(lines) else 0
 
 
 def has_begun(folder: Path) -> bool:

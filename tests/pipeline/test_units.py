@@ -280,8 +280,8 @@ def test_a_recording_is_a_unit_that_says_where_it_lies() -> None:
     under_way = WorkUnit(task="roll", seeds=(1,), sources=("/rec/1",))
     units = list(RecordingScheduler(recordings(5)).next_units([done], [under_way], JobShard(0, 2)))
     assert units == [
-        WorkUnit(task="push", seeds=(2,), sources=("/rec/2",)),
-        WorkUnit(task="push", seeds=(4,), sources=("/rec/4",)),
+        WorkUnit(task="push", seeds=(2,), sources=("/rec/2",), contents=("",)),
+        WorkUnit(task="push", seeds=(4,), sources=("/rec/4",), contents=("",)),
     ]
     (request,) = units[0].requests
     assert (request.task, request.seed, request.source) == ("push", 2, "/rec/2")
