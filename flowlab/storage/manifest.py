@@ -1,4 +1,4 @@
-"""The two kinds of JSON record in a dataset: one manifest, and one receipt per work unit."""
+"""The manifest of a dataset: how it was made, and in what frames and units it speaks."""
 
 import hashlib
 import json

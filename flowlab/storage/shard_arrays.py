@@ -1,7 +1,7 @@
 """The arrays of a shard, decoded from its files: zarr v3 in the one form that flowlab writes, and no other.
 
-Zarr's own library reads them as well; it takes ten times as long for arrays as short as these, and believes what their
-metadata claim: any codec, any size.
+Zarr's own library reads them as well; it takes three times as long for arrays as short as these
+(``benchmarks/load.py``), and believes what their metadata claim: any codec, any size.
 """
 
 import math
