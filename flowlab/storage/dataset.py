@@ -21,7 +21,7 @@ from flowlab.storage.manifest import MANIFEST, Manifest, differences
 from flowlab.storage.receipts import check_widths, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.schema import SCHEMA_VERSION
-from flowlab.storage.shard import Shard
+from flowlab.storage.shard import REPAIR, Shard
 from flowlab.text import cut
 from flowlab.untrusted import is_there
 
@@ -149,7 +149,7 @@ class Dataset(EpisodeSequence):
         checksum = next(r.rejects_sha256 for r in self.receipts if r.rejects_shard == ref.shard)
         if checksum and is_there(self.path / ref.shard) and sha256_of(self.path / ref.shard) != checksum:
             raise DataError(
-                f"{self.path / ref.shard}: damaged (its content does not match the checksum in its receipt)"
+                f"{self.path / ref.shard}: damaged (its content does not match the checksum in its receipt); {REPAIR}"
             )
         return Shard(self.path / ref.shard).episode(ref.position)
 

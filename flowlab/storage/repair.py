@@ -4,8 +4,8 @@ from pathlib import Path
 
 from flowlab.errors import DataError
 from flowlab.storage.dataset import Dataset
-from flowlab.storage.receipts import Receipt, read_receipt, receipt_files
-from flowlab.storage.validation import check_unit
+from flowlab.storage.receipts import read_receipt, receipt_files
+from flowlab.storage.validation import check_unit, lost_shards
 
 
 def forget_damaged(folder: Path, *, thorough: bool = False) -> list[str]:
@@ -40,10 +40,4 @@ def _problem(folder: Path, path: Path) -> str:
         receipt = read_receipt(path)
     except DataError as error:
         return str(error)
-    return "".join(f"{folder / shard}: missing, though {path} counts it" for shard in _lost(folder, receipt)[:1])
-
-
-def _lost(folder: Path, receipt: Receipt) -> list[str]:
-    shards = [receipt.shard] if receipt.accepted else []
-    shards += [receipt.rejects_shard] if any(x.position is not None for x in receipt.rejects) else []
-    return [shard for shard in shards if not (folder / shard).exists()]
+    return "".join(f"{shard}: missing, though {path} counts it" for shard in lost_shards(folder, receipt)[:1])

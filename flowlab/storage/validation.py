@@ -61,13 +61,12 @@ def check_unit(dataset: Dataset, receipt: Receipt, *, contents: bool = True) -> 
         if checksum and place.is_file() and sha256_of(place) != checksum:
             yield Finding(str(place), f"damaged (its content does not match the checksum in its receipt); {REPAIR}")
             return
-    if any(x.position is not None for x in receipt.rejects) and not (dataset.path / receipt.rejects_shard).exists():
-        yield Finding(str(dataset.path / receipt.rejects_shard), f"missing, but {_book(dataset, receipt)}; {REPAIR}")
-    if not receipt.accepted:
-        return
+    lost = lost_shards(dataset.path, receipt)
+    for place in lost:
+        book = f"{dataset.path}/receipts/{receipt.unit}.json counts it"
+        yield Finding(str(place), f"missing, but {book}; {REPAIR}")
     place = dataset.path / receipt.shard
-    if not place.exists():
-        yield Finding(str(place), f"missing, but {_book(dataset, receipt)}; {REPAIR}")
+    if not receipt.accepted or place in lost:
         return
     try:
         yield from _check_shard(dataset, receipt, Shard(place), contents)
@@ -75,8 +74,11 @@ def check_unit(dataset: Dataset, receipt: Receipt, *, contents: bool = True) -> 
         yield finding_of(place, error)
 
 
-def _book(dataset: Dataset, receipt: Receipt) -> str:
-    return f"{dataset.path}/receipts/{receipt.unit}.json counts it"
+def lost_shards(folder: Path, receipt: Receipt) -> list[Path]:
+    """The shards that a receipt counts, and that are not there."""
+    shards = [receipt.shard] if receipt.accepted else []
+    shards += [receipt.rejects_shard] if any(x.position is not None for x in receipt.rejects) else []
+    return [folder / shard for shard in shards if not (folder / shard).exists()]
 
 
 def finding_of(path: Path, error: DataError) -> Finding:
