@@ -43,7 +43,9 @@ def facts_of(one: InspectedRecording) -> dict[str, Any]:
 def sheet_paths(png: Path, recordings: Sequence[Recorded]) -> dict[Recorded, Path]:
     """Where the sheet of each recording is drawn: ``png`` of the only one, else a name with that of the recording."""
     if png.suffix.lower() != ".png":
-        raise UsageError(f"{png}: a sheet is a picture whose name ends with .png, as in --png {png.with_suffix('.png')}")
+        raise UsageError(
+            f"{png}: a sheet is a picture whose name ends with .png, as in --png {png.with_suffix('.png')}"
+        )
     if len(recordings) == 1:
         return {recordings[0]: png}
     paths: dict[Recorded, Path] = {}

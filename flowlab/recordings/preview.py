@@ -17,7 +17,7 @@ from flowlab.recordings.parsing import ParsedRecording, RecordingSettings, known
 from flowlab.recordings.registration_check import depth_edges
 from flowlab.recordings.sync import find_gaps
 
-_CLOUD_POINTS = 60_000
+_CLOUD_POINTS = 80_000
 _REACH_M = 3.0
 """Numbers that spread over more are not the places of a gripper."""
 _PLACES = re.compile(r"(?:^|[^a-z0-9])(?:p(?:os)?_?)?[xyz]$", re.IGNORECASE)
@@ -124,7 +124,7 @@ def _pictures(source: ParsedRecording, processor: FrameProcessor | None, width: 
             else:
                 rgb, depth = _thinned(rgb, width), _thinned(depth, width)
             apart = depth.shape != rgb.shape[:2] or (processor is None and streams.registered is False)
-            edges = None if apart else depth_edges(depth).any(0)
+            edges = None if apart else depth_edges(depth).max(0) > 0
             yield PicturePreview(streams.color.names[i], float(_since(streams, streams.color)[i]), rgb, edges)
 
 
@@ -135,8 +135,7 @@ def _thinned(picture: np.ndarray, width: int) -> np.ndarray:
 
 
 def _since(streams: Streams, stream: ImageStream | SampleStream) -> Float64[np.ndarray, "N"]:
-    since: Float64[np.ndarray, "N"] = stream.time_s - streams.color.time_s[0]
-    return since
+    return np.asarray(stream.time_s - streams.color.time_s[0])
 
 
 def _streams(source: ParsedRecording) -> Iterator[StreamPreview]:
@@ -182,7 +181,7 @@ def _gripper(source: ParsedRecording) -> tuple[Float64[np.ndarray, "T 3"] | None
 
 
 def _coordinates(names: Sequence[str]) -> list[int] | None:
-    """The first three columns that follow each other and are called x, y and z; the first three where none has a name."""
+    """Three columns that follow each other and are called x, y and z; the first three where none has a name."""
     if len(names) >= 3 and not any(names):
         return [0, 1, 2]
     for k in range(len(names) - 2):
