@@ -1,6 +1,7 @@
 """The first cloud of a recording from above: with it workspace, world axes, camera, and path of the gripper."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.patheffects as effects
 import numpy as np
@@ -28,7 +29,7 @@ def draw_cloud_from_above(axes: Axes, cloud: CloudPreview, crop: Box | None) -> 
     """
     up = up_from_world(cloud.camera)
     xyz = cloud.xyz_world @ up.T
-    inside: np.ndarray = np.ones(len(xyz), bool)
+    inside: Any = np.ones(len(xyz), bool)
     shown = [xyz[:, :2]]
     if crop is not None:
         low, high = np.array(crop.low), np.array(crop.high)
