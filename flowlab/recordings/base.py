@@ -78,6 +78,8 @@ class Streams:
     """Whether depth is seen from the color camera; None where the layout does not say."""
     checks: tuple[Check, ...] = ()
     """What the reader looked at, and what came of it."""
+    used: tuple[str, ...] | None = None
+    """The files and folders below a recording that it is made of; None where the reader does not say."""
 
 
 @runtime_checkable

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from flowlab.geometry.moving import MOVING_IN_EPISODE_M
-from flowlab.records import Episode, PositionSource, Role
 from flowlab.recordings.verdicts import Verdict, stored_checks
+from flowlab.records import Episode, PositionSource, Role
 from flowlab.text import markdown
 from flowlab.viz.colors import SIGMA_LIMIT
 

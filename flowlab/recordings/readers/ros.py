@@ -78,6 +78,7 @@ class ROSReader:
             known=(*known, _unit(bag, topics.depth)),
             registered=registered,
             checks=tuple(checks),
+            used=bag.files(),
         )
 
 
