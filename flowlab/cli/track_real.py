@@ -4,13 +4,16 @@ import json
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
+from flowlab.cli.console import ProgressBar, echo, print_json, say, show_extraction
 from flowlab.cli.paths import PATH
 from flowlab.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from flowlab.pipeline.recipe import Recipe
 
 
 @click.command("track-real")
@@ -80,9 +83,11 @@ def track_real(
         _dry_run(paths, task, workers, as_json, estimate, png, recipe=recipe, settings=changes, **known)
         return
     from flowlab.cli.reports import finish_extraction
-    from flowlab.pipeline.labeling import label
+    from flowlab.pipeline.labeling import label, labeling_recipe
 
     start = time.monotonic()
+    if not as_json:
+        _say_if_compiling(labeling_recipe(recipe, changes, **known))
     with ProgressBar(quiet=as_json) as bar:
         dataset = label(
             paths, out, task=task, tracker=tracker, calibration=calibration, weights=weights, recipe=recipe,
@@ -90,6 +95,14 @@ def track_real(
             repair=repair, on_progress=lambda progress: show_extraction(bar, progress, "labeling", count_rejects=True),
         )  # fmt: skip
     finish_extraction(dataset, time.monotonic() - start, share, as_json)
+
+
+def _say_if_compiling(recipe: "Recipe") -> None:
+    """Tell why the first labeling on a machine takes longer to begin."""
+    from flowlab.pipeline.compilation import NOTICE, will_compile
+
+    if will_compile(recipe):
+        say(f"flowlab: {NOTICE}")
 
 
 def _dry_run(
@@ -118,6 +131,8 @@ def _dry_run(
             facts[-1]["sheet"] = str(sheet)
         if not as_json:
             echo(*lines_of(facts[-1]))
+    if estimate and not as_json:
+        _say_if_compiling(chosen)
     plan = asdict(estimate_labeling(chosen, inspected, workers)) if estimate else {"frames": frame_count(inspected)}
     if as_json:
         print_json({"recordings": facts} | plan)
