@@ -78,7 +78,7 @@ def track_real(
         raise UsageError("name the folder of the dataset, as in --out data/pour; or look first with --dry-run")
     if png is not None and not dry_run:
         raise UsageError("--png is about what is recognized; add --dry-run")
-    known = {"tracker": tracker, "calibration": calibration, "weights": weights}
+    known: dict[str, Any] = {"tracker": tracker, "calibration": calibration, "weights": weights}
     if out is None or dry_run:
         _dry_run(paths, task, workers, as_json, estimate, png, recipe=recipe, settings=changes, **known)
         return

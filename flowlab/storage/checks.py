@@ -148,7 +148,7 @@ def _off_surface(e: Episode) -> Iterator[ArrayProblem]:
     visible point, which is within a pixel of the cloud, is that near to the sample; unless it has left
     the crop, which the cloud's extent tells. Estimated points may be off by as much as they say.
     """
-    from scipy.spatial import cKDTree  # half a second of CPU time that nothing else of storage needs
+    from scipy.spatial import cKDTree  # heavy, and nothing else of storage needs it
 
     far = total = 0
     quality = e.tracks.quality
