@@ -1,11 +1,10 @@
 """The first cloud of a recording from above: with it workspace, world axes, camera, and path of the gripper."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib.patheffects as effects
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, UInt8
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
@@ -15,6 +14,8 @@ from flowlab.viz.orientation import up_from_world
 from flowlab.viz.plot_style import INK, LABEL_PT, ORANGE, PURPLE, QUIET, TICK_PT, label_text, style_axes
 
 _AXES_M = 0.15
+_AROUND = 0.5
+"""So much of the workspace's length is shown around it."""
 _FAR_M = 4.0
 """What is farther from the middle of the cloud, and than the cloud is wide, is left out of the picture."""
 
@@ -29,32 +30,46 @@ def draw_cloud_from_above(axes: Axes, cloud: CloudPreview, crop: Box | None) -> 
     """
     up = up_from_world(cloud.camera)
     xyz = cloud.xyz_world @ up.T
-    inside: Any = np.ones(len(xyz), bool)
-    shown = [xyz[:, :2]]
+    heading, inside, near = "first cloud from above", np.ones(len(xyz), bool), xyz[:, :2]
+    shown = [_draw_world(axes, up), _draw_camera(axes, cloud, up)]
     if crop is not None:
         low, high = np.array(crop.low), np.array(crop.high)
-        inside = ((cloud.xyz_world > low) & (cloud.xyz_world < high)).all(1)
-    order = np.argsort(xyz[:, 2], kind="stable")  # what is higher hides what is below it
-    rgb = np.where(inside[:, None], cloud.rgb, 255 - (255 - cloud.rgb.mean(1, keepdims=True)) * 0.3) / 255
-    axes.scatter(xyz[order, 0], xyz[order, 1], 1.2, rgb[order], linewidths=0, rasterized=True)
-    if crop is not None:
-        corners = np.array([[low[0], low[1], low[2]], [high[0], high[1], high[2]]]) @ up.T
-        (x0, y0), (x1, y1) = corners.min(0)[:2], corners.max(0)[:2]
-        axes.add_patch(
-            Polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], fill=False, edgecolor=INK, linewidth=1.3, zorder=4)
-        )
-        shown.append(np.array([(x0, y0), (x1, y1)]))
-    shown += [_draw_world(axes, up), _draw_camera(axes, cloud, up)]
+        inside = np.logical_and(cloud.xyz_world > low, cloud.xyz_world < high).all(axis=1, out=inside)
+        heading += f", {inside.mean() if len(inside) else 0:.0%} of it in the workspace"
+        shown.append(_draw_workspace(axes, np.array([low, high]) @ up.T))
+        if inside.any():
+            near = _around(near, shown[-1])
+    _draw_points(axes, xyz, cloud.rgb, inside)
     if cloud.gripper_world is not None:
         shown.append(_draw_gripper(axes, cloud.gripper_world @ up.T, cloud.gripper_names))
-    heading = "first cloud from above"
-    if crop is not None:
-        heading += f", {inside.mean() if len(inside) else 0:.0%} of it in the workspace"
     style_axes(axes, heading)
     names = ("x", "y") if up[1, 1] else ("x", "z, away from the camera")
     axes.set_xlabel(f"{names[0]} [m]", color=QUIET, fontsize=LABEL_PT)
     axes.set_ylabel(f"{names[1]} [m]", color=QUIET, fontsize=LABEL_PT)
-    _set_limits(axes, shown)
+    _set_limits(axes, [near, *shown])
+
+
+def _draw_points(
+    axes: Axes, xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"], inside: Bool[np.ndarray, "P"]
+) -> None:
+    """The points, those outside of the workspace pale."""
+    order = np.argsort(xyz[:, 2], kind="stable")  # what is higher hides what is below it
+    drawn = np.where(inside[:, None], rgb, 255 - (255 - rgb.mean(1, keepdims=True)) * 0.3) / 255
+    axes.scatter(xyz[order, 0], xyz[order, 1], 1.5, drawn[order], linewidths=0, rasterized=True)
+
+
+def _draw_workspace(axes: Axes, corners: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, "2 2"]:
+    """The box of the workspace."""
+    (x0, y0), (x1, y1) = corners.min(0)[:2], corners.max(0)[:2]
+    box = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    axes.add_patch(Polygon(box, fill=False, edgecolor=INK, linewidth=1.3, zorder=4))
+    return np.array([(x0, y0), (x1, y1)])
+
+
+def _around(places: Float64[np.ndarray, "P 2"], box: Float64[np.ndarray, "2 2"]) -> Float64[np.ndarray, "N 2"]:
+    """Those in a box and around it, by as much as it is wide."""
+    margin = np.ptp(box, axis=0).max() * _AROUND
+    return places[((places > box[0] - margin) & (places < box[1] + margin)).all(1)]
 
 
 def _set_limits(axes: Axes, shown: Sequence[Float64[np.ndarray, "N 2"]]) -> None:
