@@ -121,9 +121,27 @@ class Clip(Record):
     depth: Float32[np.ndarray, "T H W"]
     """z-depth [m], registered to the color picture; 0 where there is no reading."""
     camera: Camera
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    """See :class:`Demonstration`."""
 
     def __len__(self) -> int:
         return len(self.rgb)
+
+    def poses(self) -> Float64[np.ndarray, "T 4 4"]:
+        """The pose of the camera in every frame, whether it moves or not."""
+        if self.T_world_cam is not None:
+            return self.T_world_cam
+        return np.broadcast_to(np.asarray(self.camera.T_world_cam, float), (len(self), 4, 4))
+
+    def to_world(self, xyz_cam: Float[np.ndarray, "T M 3"]) -> Float[np.ndarray, "T M 3"]:
+        """Points in the camera frame of each row [m] in the world."""
+        T = self.poses()
+        return xyz_cam @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
+
+    def to_camera(self, xyz_world: Float[np.ndarray, "T M 3"]) -> Float[np.ndarray, "T M 3"]:
+        """The inverse of :meth:`to_world`."""
+        T = self.poses()
+        return (xyz_world - T[:, None, :3, 3]) @ T[:, :3, :3]
 
     def _check_values(self) -> None:
         if self.depth.size and (least := np.nanmin(self.depth)) < 0:
@@ -219,6 +237,7 @@ class Demonstration(Record, ABC):
     task: str
     seed: int
     camera: Camera
+    """Where it moves, as it was in the first row."""
     time_s: Float64[np.ndarray, "T"]
     """When each row was, since the first [s]."""
     state: Float32[np.ndarray, "T S"]
@@ -230,12 +249,19 @@ class Demonstration(Record, ABC):
     """Position [m] and 6D rotation of the manipulated body, where it is known."""
     extras: Mapping[str, Any] = field(default_factory=dict)
     """Small JSON values of where it comes from, such as MetaWorld's ``rand_vec``."""
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    """The pose of a camera that moves, in every row: maps its coordinates to the world's [m]. None for one that stands
+    still, whose pose ``camera`` has."""
 
     def __len__(self) -> int:
         return len(self.action)
 
     def _check_values(self) -> None:
         _check_rows(self)
+
+    def camera_at(self, t: int) -> Camera:
+        """The camera as it was at step ``t``."""
+        return _camera_at(self, t)
 
     @abstractmethod
     def frame(self, t: int) -> Frame:
@@ -300,9 +326,21 @@ class Episode(Record):
     depth: Float32[np.ndarray, "T H W"] | None = None
     rgb: UInt8[np.ndarray, "T H W 3"] | None = None
     extras: Mapping[str, Any] = field(default_factory=dict)
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
 
     def __len__(self) -> int:
         return len(self.action)
+
+    def camera_at(self, t: int) -> Camera:
+        """The camera as it was at step ``t``.
+
+        Args:
+            t: The step, from 0.
+
+        Returns:
+            ``camera``, where it stands still.
+        """
+        return _camera_at(self, t)
 
     def check_numbers(self) -> None:
         """Refuse what nobody may store. An episode that is read may have it: a damaged dataset has to be looked into.
@@ -325,6 +363,11 @@ class Episode(Record):
         """The :class:`Role` of every query's owner, -1 where it is not known."""
         roles = np.array([e.role for e in self.queries.entities] + [-1])
         return roles[self.queries.owner]
+
+
+def _camera_at(of: Demonstration | Episode, t: int) -> Camera:
+    """The camera of a row."""
+    return of.camera if of.T_world_cam is None else of.camera.at(of.T_world_cam[t])
 
 
 def _check_rows(of: Demonstration | Episode) -> None:

@@ -25,4 +25,5 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
         depth=seen.depth,
         rgb=seen.rgb,
         extras={**demo.extras, **extras},
+        T_world_cam=demo.T_world_cam,
     )

@@ -110,7 +110,7 @@ def clip_of(record: QueriedDemo) -> Clip:
     seen = record.observed
     if seen.rgb is None:
         raise Rejected("the recording has no color pictures, and points are followed in these; record color too")
-    return Clip(seen.rgb, seen.depth, seen.demo.camera)
+    return Clip(seen.rgb, seen.depth, seen.demo.camera, seen.demo.T_world_cam)
 
 
 class LiftStage(Stage, LiftSettings):
