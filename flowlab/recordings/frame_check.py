@@ -5,14 +5,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
+from flowlab.recordings.poses import ABOUT, poses_at
 from flowlab.recordings.sync import nearest_sample, sampling_rate
-from flowlab.recordings.verdicts import Check
+from flowlab.recordings.verdicts import Check, Verdict
 
 _NEAR = 0.55
 """So many intervals away a sample may be that is the nearest of a stream without a loss."""
@@ -48,6 +49,8 @@ class FrameCheck:
     """What was looked at in the pictures, and what came of it."""
     samples: tuple[PictureSample, ...] = ()
     """Small pictures of some rows, evenly spaced."""
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    """The pose of a camera that moves, at every row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +75,15 @@ def check_frames(
     stop_s: float | None,
     max_sync_s: float,
     max_state_s: float,
+    pose_gap_s: float = 0.0,
     stated: Sequence[str] = (),
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
-    an interval; and where its time does not lie after the frame before. ``stated`` are the streams of which the user
+    an interval; where no poses of a camera that moves are around it that are at most ``pose_gap_s`` apart; and where
+    its time does not lie after the frame before. ``stated`` are the streams of which the user
     says how they belong to color.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
@@ -88,6 +93,7 @@ def check_frames(
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
+    poses = None if streams.poses is None else poses_at(streams.poses, clock, pose_gap_s)
     kept = sorted(chosen(len(frames)))
     keep_color, keep_depth = set(frames[kept].tolist()), set(match[kept].tolist())
     color = {int(i): _look(streams.color, int(i), _look_at_color, int(i) in keep_color) for i in frames}
@@ -96,7 +102,7 @@ def check_frames(
         for i in np.unique(match[off <= max_sync_s])
     }
     color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
-    good, bad, last = [], [], -np.inf
+    good, used, bad, last = [], [], [], -np.inf
     for k, (i, j) in enumerate(zip(frames.tolist(), match.tolist(), strict=True)):
         name = streams.color.names[i]
         fault = _fault(name, color[i], color_size)
@@ -106,10 +112,13 @@ def check_frames(
             fault = BadFrame(name, f"no depth within {_ms(max_sync_s)}: the nearest is {_ms(off[k])} away")
         if fault is None:
             fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state)
+        if fault is None and poses is not None and not poses[1][k]:
+            fault = BadFrame(name, f"no pose: none at its time, and none on both sides within {_ms(pose_gap_s)}")
         if fault is not None:
             bad.append(fault)
             continue
         good.append((i, j))
+        used.append(k)
         last = clock[k]
     rows = np.array(good, np.int64).reshape(-1, 2)
     digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
@@ -117,13 +126,28 @@ def check_frames(
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
     checks = (repeats, *motion_checks(streams, digests[0], digests[1], stated))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
-    rows = np.delete(rows, list(frozen), axis=0)
+    rows, used = np.delete(rows, list(frozen), axis=0), np.delete(np.array(used, int), list(frozen))
+    if poses is not None:
+        checks += (_pose_check(streams, poses[1], pose_gap_s),)
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
     return FrameCheck(
-        rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples
-    )
+        rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples,
+        None if poses is None else poses[0][used],
+    )  # fmt: skip
+
+
+def _pose_check(streams: Streams, known: Bool[np.ndarray, "F"], gap_s: float) -> Check:
+    """How many frames have a pose, and of which poses."""
+    assert streams.poses is not None
+    time_s = streams.poses.time_s
+    says = (f"{len(time_s)} from {streams.poses.name}, {sampling_rate(time_s):.3g} a second, tell where the "
+            f"camera is in {known.sum()} of {len(known)} frames, between poses at most {_ms(gap_s)} apart")  # fmt: skip
+    if known.all():
+        return Check(ABOUT, Verdict.OK, says)
+    return Check(ABOUT, Verdict.DOUBTFUL, f"{says}; the others are left out: 'T_world_cam_gap_s' says how far "
+                 "apart poses may be")  # fmt: skip
 
 
 def _samples(
