@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from flowlab.errors import DataError
-from flowlab.geometry.transforms import apply, inverse
+from flowlab.geometry.transforms import apply, inverse, rigid
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.frame_processing import FrameProcessor
 from flowlab.recordings.poses import poses_at
@@ -18,7 +18,7 @@ from flowlab.recordings.verdicts import Check, Verdict
 if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
 
-_STARTS = 12
+_STARTS = 8
 """So many rows, evenly spread, are compared with later ones."""
 _LAGS_S = (0.1, 0.4)
 """How much later those are [s]."""
@@ -32,12 +32,14 @@ _TEXTURE = 2.0
 """Gray levels that differ by this from pixel to pixel, in the mean, are a texture."""
 _EDGE = 0.05
 """Depth that differs by this share beside a pixel has an edge there."""
-_FLOOR = (0.004, 0.012)
+_FLOOR = (0.004, 0.01)
 """What sensors and flow err by: a length [m], and a share of the distance."""
 _EXPLAINED = 0.5
 """Right poses leave less than this share of how far the scene moves before the camera."""
 _BETTER = 0.5
 """Another reading of the poses is the right one where it leaves less than this share of what they leave."""
+_SHIFTED = 0.7
+"""The same, of poses at other times."""
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
 _OPENGL = np.diag([1.0, -1, -1, 1])
 _BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -47,6 +49,7 @@ _READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "in OpenGL's axes (y up, z backward)": lambda T: T @ _OPENGL,
     "the inverse, in OpenGL's axes": lambda T: inverse(T) @ _OPENGL,
     "the inverse of those in OpenGL's axes": lambda T: inverse(T @ _OPENGL),
+    "in millimeters": lambda T: rigid(T[:, :3, :3], T[:, :3, 3] / 1000),
     "those of a body (x forward, y left, z up)": lambda T: T @ _BODY,
 }
 
@@ -76,21 +79,22 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     off, fixed = _off_m(pairs, T), _off_m(pairs, np.tile(np.eye(4), (len(T), 1, 1)))
     floor = _FLOOR[0] + _FLOOR[1] * float(np.median([np.median(p.first[:, 2]) for p in pairs]))
     seen = (f"under its poses the scene stays within {1000 * off:.1f} mm in the median between {len(pairs)} pairs of "
-            f"pictures, and would move by {1000 * fixed:.1f} mm if it stood still")  # fmt: skip
-    if off <= floor and (off <= _EXPLAINED * fixed or fixed <= floor):
-        return Check("camera", Verdict.OK, f"it moves: {seen}")
+            f"pictures, and would move by {1000 * fixed:.1f} mm before a camera that stands still")  # fmt: skip
+    if off <= floor and (off <= _EXPLAINED * fixed or fixed <= 2 * floor):
+        return Check("camera", Verdict.OK, f"it moves{' little' if fixed <= 2 * floor else ''}: {seen}")
+    most = min(_BETTER * off, _EXPLAINED * fixed)
     others = {how: _off_m(pairs, read(T)) for how, read in _READINGS.items()}
     how = min(others, key=lambda k: others[k])
-    if others[how] < _BETTER * off:
+    if others[how] < most:
         return Check("camera", Verdict.REFUSED, f"{seen}, within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam "  # noqa: E501
                      "must map coordinates of the camera (x right, y down, z forward) to the world's; correct the poses")  # fmt: skip
     late, best = _best_offset(source, pairs)
-    if best < _BETTER * off:
+    if best < min(_SHIFTED * off, floor):
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)
         return Check("camera", Verdict.REFUSED, f"{seen}, within {1000 * best:.1f} mm if {late:g} s were added to the times "  # noqa: E501
                      f"of the poses: their clocks differ; write 'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
     worse = off > _EXPLAINED * fixed
-    refused = worse and off > 2 * floor
+    refused = worse and off > 1.5 * floor
     why = "they explain too little of it" if worse else "that is more than sensors err by"
     return Check("camera", Verdict.REFUSED if refused else Verdict.DOUBTFUL, f"{seen}: {why}; the poses must be those of the "  # noqa: E501
                  "color camera itself (x right, y down, z forward), not of a flange or another camera, in meters, on the "
