@@ -38,8 +38,10 @@ _EXPLAINED = 0.5
 """Right poses leave less than this share of how far the scene moves before the camera."""
 _BETTER = 0.5
 """Another reading of the poses is the right one where it leaves less than this share of what they leave."""
-_SHIFTED = 0.7
+_SHIFTED = 0.6
 """The same, of poses at other times."""
+_SHIFT_M = 0.003
+"""And by no less than this [m]."""
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
 _OPENGL = np.diag([1.0, -1, -1, 1])
 _BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -80,6 +82,12 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     floor = _FLOOR[0] + _FLOOR[1] * float(np.median([np.median(p.first[:, 2]) for p in pairs]))
     seen = (f"under its poses the scene stays within {1000 * off:.1f} mm in the median between {len(pairs)} pairs of "
             f"pictures, and would move by {1000 * fixed:.1f} mm before a camera that stands still")  # fmt: skip
+    late, best = _best_offset(source, pairs)
+    if best < min(_SHIFTED * off, floor) and off - best > _SHIFT_M:
+        write = late + (source.metadata.T_world_cam_offset_s or 0.0)
+        says = (f"{seen}, within {1000 * best:.1f} mm if {late:g} s were added to the times of the poses: their clocks differ; "
+                f"write 'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
+        return Check("camera", Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, says)
     if off <= floor and (off <= _EXPLAINED * fixed or fixed <= 2 * floor):
         return Check("camera", Verdict.OK, f"it moves{' little' if fixed <= 2 * floor else ''}: {seen}")
     most = min(_BETTER * off, _EXPLAINED * fixed)
@@ -88,11 +96,6 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     if others[how] < most:
         return Check("camera", Verdict.REFUSED, f"{seen}, within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam "  # noqa: E501
                      "must map coordinates of the camera (x right, y down, z forward) to the world's; correct the poses")  # fmt: skip
-    late, best = _best_offset(source, pairs)
-    if best < min(_SHIFTED * off, floor):
-        write = late + (source.metadata.T_world_cam_offset_s or 0.0)
-        return Check("camera", Verdict.REFUSED, f"{seen}, within {1000 * best:.1f} mm if {late:g} s were added to the times "  # noqa: E501
-                     f"of the poses: their clocks differ; write 'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
     worse = off > _EXPLAINED * fixed
     refused = worse and off > 1.5 * floor
     why = "they explain too little of it" if worse else "that is more than sensors err by"
