@@ -393,7 +393,7 @@ def test_what_flowlab_writes_is_read_back(frames: Frames, tmp_path: Path, capsys
     np.testing.assert_allclose(e.T_world_cam, POSES[::2], rtol=0, atol=1e-12)
     still, _ = errors_mm(e, every=2)
     assert np.median(still) < 15
-    code, _, errors = call_cli(capsys, "viz", tmp_path / "out", "-o", tmp_path / "e.rrd")
+    code, _, errors = call_cli(capsys, "viz", tmp_path / "out", "--save", tmp_path / "e.rrd")
     assert code == 0, errors
 
 
