@@ -5,15 +5,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
-from flowlab.recordings.poses import ABOUT, poses_at
+from flowlab.recordings.poses import check_known, poses_at
 from flowlab.recordings.sync import nearest_sample, sampling_rate
-from flowlab.recordings.verdicts import Check, Verdict
+from flowlab.recordings.verdicts import Check
 
 _NEAR = 0.55
 """So many intervals away a sample may be that is the nearest of a stream without a loss."""
@@ -102,7 +102,7 @@ def check_frames(
         for i in np.unique(match[off <= max_sync_s])
     }
     color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
-    good, used, bad, last = [], [], [], -np.inf
+    good, bad, last = [], [], -np.inf
     for k, (i, j) in enumerate(zip(frames.tolist(), match.tolist(), strict=True)):
         name = streams.color.names[i]
         fault = _fault(name, color[i], color_size)
@@ -118,7 +118,6 @@ def check_frames(
             bad.append(fault)
             continue
         good.append((i, j))
-        used.append(k)
         last = clock[k]
     rows = np.array(good, np.int64).reshape(-1, 2)
     digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
@@ -126,28 +125,18 @@ def check_frames(
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
     checks = (repeats, *motion_checks(streams, digests[0], digests[1], stated))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
-    rows, used = np.delete(rows, list(frozen), axis=0), np.delete(np.array(used, int), list(frozen))
-    if poses is not None:
-        checks += (_pose_check(streams, poses[1], pose_gap_s),)
+    rows = np.delete(rows, list(frozen), axis=0)
+    T_world_cam = None
+    if streams.poses is not None and poses is not None:
+        T_world_cam, _ = poses_at(streams.poses, streams.color.time_s[rows[:, 0]], pose_gap_s)
+        checks += (check_known(streams.poses, poses[1], pose_gap_s),)
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
     return FrameCheck(
         rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples,
-        None if poses is None else poses[0][used],
+        T_world_cam,
     )  # fmt: skip
-
-
-def _pose_check(streams: Streams, known: Bool[np.ndarray, "F"], gap_s: float) -> Check:
-    """How many frames have a pose, and of which poses."""
-    assert streams.poses is not None
-    time_s = streams.poses.time_s
-    says = (f"{len(time_s)} from {streams.poses.name}, {sampling_rate(time_s):.3g} a second, tell where the "
-            f"camera is in {known.sum()} of {len(known)} frames, between poses at most {_ms(gap_s)} apart")  # fmt: skip
-    if known.all():
-        return Check(ABOUT, Verdict.OK, says)
-    return Check(ABOUT, Verdict.DOUBTFUL, f"{says}; the others are left out: 'T_world_cam_gap_s' says how far "
-                 "apart poses may be")  # fmt: skip
 
 
 def _samples(

@@ -76,7 +76,7 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
             return Check(what, Verdict.DOUBTFUL, says)
     if name.stem.lower().startswith(_OF_CAMERAS) and source.streams.poses is None:
         says = (
-            f"{cut(file.name)} is not used; if it has poses of a camera that moves, each mapping camera to world, write "
+            f"{cut(file.name)} is not used; if it has poses of a camera that moves, each camera to world, write "
             f"'T_world_cam_file: {cut(file.name)}' into {FILE_NAME}, if one of a camera that stands still, that as "
             "'T_world_cam'"
         )

@@ -79,29 +79,36 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
         says = "it moves as its poses say; too little texture and depth in the pictures to tell whether these are right"
         return Check("camera", Verdict.ASSUMED, says)
     off, fixed = _off_m(pairs, T), _off_m(pairs, np.tile(np.eye(4), (len(T), 1, 1)))
-    floor = _FLOOR[0] + _FLOOR[1] * float(np.median([np.median(p.first[:, 2]) for p in pairs]))
     seen = (f"under its poses the scene stays within {1000 * off:.1f} mm in the median between {len(pairs)} pairs of "
             f"pictures, and would move by {1000 * fixed:.1f} mm before a camera that stands still")  # fmt: skip
+    verdict, says = _judged(source, pairs, off, fixed)
+    return Check("camera", verdict, f"it moves{says}: {seen}" if verdict is Verdict.OK else f"{seen}{says}")
+
+
+def _judged(source: "ParsedRecording", pairs: list[_Pair], off: float, fixed: float) -> tuple[Verdict, str]:
+    """What follows from how far apart points are under the poses, and would be without [m]."""
+    T = source.frame_check.T_world_cam
+    assert T is not None
+    floor = _FLOOR[0] + _FLOOR[1] * float(np.median([np.median(p.first[:, 2]) for p in pairs]))
     late, best = _best_offset(source, pairs)
     if best < min(_SHIFTED * off, floor) and off - best > _SHIFT_M:
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)
-        says = (f"{seen}, within {1000 * best:.1f} mm if {late:g} s were added to the times of the poses: their clocks differ; "
-                f"write 'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
-        return Check("camera", Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, says)
+        return Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, (
+            f", within {1000 * best:.1f} mm if {late:g} s were added to the times of the poses: their clocks differ; write "
+            f"'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
     if off <= floor and (off <= _EXPLAINED * fixed or fixed <= 2 * floor):
-        return Check("camera", Verdict.OK, f"it moves{' little' if fixed <= 2 * floor else ''}: {seen}")
-    most = min(_BETTER * off, _EXPLAINED * fixed)
+        return Verdict.OK, " little" if fixed <= 2 * floor else ""
     others = {how: _off_m(pairs, read(T)) for how, read in _READINGS.items()}
     how = min(others, key=lambda k: others[k])
-    if others[how] < most:
-        return Check("camera", Verdict.REFUSED, f"{seen}, within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam "  # noqa: E501
-                     "must map coordinates of the camera (x right, y down, z forward) to the world's; correct the poses")  # fmt: skip
+    if others[how] < min(_BETTER * off, _EXPLAINED * fixed):
+        return Verdict.REFUSED, (
+            f", within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam must map coordinates of the camera (x "
+            "right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
     worse = off > _EXPLAINED * fixed
-    refused = worse and off > 1.5 * floor
     why = "they explain too little of it" if worse else "that is more than sensors err by"
-    return Check("camera", Verdict.REFUSED if refused else Verdict.DOUBTFUL, f"{seen}: {why}; the poses must be those of the "  # noqa: E501
-                 "color camera itself (x right, y down, z forward), not of a flange or another camera, in meters, on the "
-                 "clock of the pictures ('T_world_cam_offset_s')")  # fmt: skip
+    return Verdict.REFUSED if worse and off > 1.5 * floor else Verdict.DOUBTFUL, (
+        f": {why}; the poses must be those of the color camera itself (x right, y down, z forward), not of a flange or "
+        "another camera, in meters, on the clock of the pictures ('T_world_cam_offset_s')")  # fmt: skip
 
 
 def _off_m(pairs: list[_Pair], T: Float[np.ndarray, "T 4 4"]) -> float:
@@ -124,7 +131,7 @@ def _best_offset(source: "ParsedRecording", pairs: list[_Pair]) -> tuple[float, 
 
 
 def _pairs(source: "ParsedRecording") -> Iterator[_Pair]:
-    """Points that pairs of rows both show, found by flow of color and read by depth; none where cameras are not known."""
+    """Points that pairs of rows both show, by flow of color and by depth; none where cameras are not known."""
     try:
         processor = source.frame_processor()
     except DataError:  # which is told elsewhere
@@ -150,7 +157,7 @@ def _rows(source: "ParsedRecording") -> list[tuple[int, int]]:
 
 
 _Taken = tuple[np.ndarray, np.ndarray]
-"""A small gray picture, and the point that each of its pixels shows in the camera frame [m], nan where depth has none."""
+"""A small gray picture, and the point in the camera frame [m] that each of its pixels shows; nan without depth."""
 
 
 def _taken(source: "ParsedRecording", processor: FrameProcessor, row: int) -> _Taken:

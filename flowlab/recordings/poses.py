@@ -14,6 +14,7 @@ from flowlab.recordings.sample_files import check_times, load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.sync import GAP, sampling_rate
 from flowlab.recordings.tables import SampleTable, base_and_unit, read_table
+from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 
 ABOUT = "poses"
@@ -33,8 +34,8 @@ _NAMES = {
 """What columns are called, by their letters and digits."""
 _PARTS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LAYOUTS = (
-    "an array (N, 4, 4); or rows of 'timestamp tx ty tz qx qy qz qw' as in TUM's ground truth, of 16 or 12 numbers (the "
-    "matrix row by row, with or without its last row), or of 17 or 13 with a timestamp before them"
+    "an array (N, 4, 4); or rows of 'timestamp tx ty tz qx qy qz qw' as in TUM's ground truth, of 16 or 12 numbers "
+    "(the matrix row by row, with or without its last row), or of 17 or 13 with a timestamp before them"
 )
 
 
@@ -183,3 +184,13 @@ def most_apart_s(color: ImageStream, stated: float | None) -> float:
     its jitter."""
     rate = sampling_rate(color.time_s)
     return stated if stated is not None else GAP / rate if 0 < rate < np.inf else 0.0
+
+
+def check_known(poses: SampleStream, known: Bool[np.ndarray, "F"], apart_s: float) -> Check:
+    """In how many frames the pose is known, and by which poses."""
+    says = (f"{len(poses.time_s)} from {poses.name}, {sampling_rate(poses.time_s):.3g} a second, tell where the camera is "
+            f"in {known.sum()} of {len(known)} frames, between poses at most {1000 * apart_s:.0f} ms apart")  # fmt: skip
+    if known.all():
+        return Check(ABOUT, Verdict.OK, says)
+    return Check(ABOUT, Verdict.DOUBTFUL, f"{says}; the others are left out: 'T_world_cam_gap_s' says how far apart "
+                 "poses may be")  # fmt: skip

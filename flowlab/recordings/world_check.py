@@ -53,12 +53,13 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
         return
     T = np.array(source.metadata.T_world_cam, float) if seen is None else seen[0]
     if np.allclose(T[:3, :3], np.eye(3), atol=1e-6):
-        says = f"{'T_world_cam' if seen is None else 'the first pose'} turns nothing, so the world has the camera's axes: x right, y down, z forward"
+        what = "T_world_cam" if seen is None else "the first pose"
+        says = f"{what} turns nothing, so the world has the camera's axes: x right, y down, z forward"
         yield Check("world", Verdict.ASSUMED, says)
         return
     stands = f"{_stands(T)}, from {source.origin.get('T_world_cam', '') if poses is None else poses.name}"
     far = float(np.linalg.norm(T[:3, 3]))
-    if far > _FAR_M[0]:
+    if far > _FAR_M[0] and poses is None:
         verdict = Verdict.REFUSED if far > _FAR_M[1] else Verdict.DOUBTFUL
         unit = ", as if in millimeters" if far > _FAR_M[1] else ""
         says = (

@@ -412,5 +412,6 @@ def test_stored_poses_are_validated(frames: Frames, tmp_path: Path, capsys: Capt
     assert e.T_world_cam is not None
     e.T_world_cam[2, :3, :3] *= 2
     write_shard(shard, [e], Shard(shard).attributes.settings_digest)
-    code, says, _ = call_cli(capsys, "validate", out)
+    code, _, findings = call_cli(capsys, "validate", out)
     assert code == 3
+    assert "data/T_world_cam" in findings + call_cli(capsys, "validate", out)[1]

@@ -13,9 +13,12 @@ from flowlab.recordings.readers.ros_messages import pose_of, relative_pose
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut, shown
 
-TYPES = tuple(
-    f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
-) + ("nav_msgs/msg/Odometry",)  # fmt: skip
+TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "nav_msgs/msg/Odometry",
+)
 
 
 def read_pose_topic(
