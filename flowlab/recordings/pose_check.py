@@ -94,16 +94,16 @@ def _judged(source: "ParsedRecording", pairs: list[_Pair], off: float, fixed: fl
     if best < min(_SHIFTED * off, floor) and off - best > _SHIFT_M:
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)
         return Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, (
-            f", within {1000 * best:.1f} mm if {late:g} s were added to the times of the poses: their clocks differ; write "
-            f"'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
+            f", within {1000 * best:.1f} mm if {late:g} s were added to the times of the poses: their clocks differ; "
+            f"write 'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
     if off <= floor and (off <= _EXPLAINED * fixed or fixed <= 2 * floor):
         return Verdict.OK, " little" if fixed <= 2 * floor else ""
     others = {how: _off_m(pairs, read(T)) for how, read in _READINGS.items()}
     how = min(others, key=lambda k: others[k])
     if others[how] < min(_BETTER * off, _EXPLAINED * fixed):
         return Verdict.REFUSED, (
-            f", within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam must map coordinates of the camera (x "
-            "right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
+            f", within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam must map coordinates of the camera "
+            "(x right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
     worse = off > _EXPLAINED * fixed
     why = "they explain too little of it" if worse else "that is more than sensors err by"
     return Verdict.REFUSED if worse and off > 1.5 * floor else Verdict.DOUBTFUL, (
