@@ -1,9 +1,14 @@
 """What tests share: one real rollout and one small dataset, each made once."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+# Tests run side by side: more threads than cores wait for each other, and take five times the CPU time. Set before any
+# library that has threads is imported.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import pytest
 from hypothesis import settings

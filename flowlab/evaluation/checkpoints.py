@@ -12,7 +12,15 @@ from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.evaluation.episode_log import EPISODES, read_results
 from flowlab.evaluation.results import CheckpointEvaluation
 from flowlab.evaluation.trials import Trial
-from flowlab.policies.checkpoint import CHECKPOINTS, POLICY, TrainedPolicy, newest_checkpoint, read_trained, step_of
+from flowlab.policies.checkpoint import (
+    POLICY,
+    TrainedPolicy,
+    all_checkpoints,
+    newest_checkpoint,
+    read_trained,
+    step_of,
+    warn_of_lost_checkpoints,
+)
 from flowlab.sim.scene_settings import SceneSettings
 
 FOLDER = "evaluation"
@@ -63,8 +71,11 @@ def find_checkpoint(path: Path, n_action_steps: int | None = None) -> Checkpoint
         DataError: There is no checkpoint, or the policy was not trained in simulation.
         UsageError: Its plans are shorter than ``n_action_steps`` steps.
     """
-    weights = newest_checkpoint(path) if path.suffix != ".safetensors" else path
-    run = weights.absolute().parents[1] if path.suffix == ".safetensors" else path
+    if path.suffix == ".safetensors":
+        weights, run = path, path.absolute().parents[1]
+    else:
+        weights, run = newest_checkpoint(path), path
+        warn_of_lost_checkpoints(run)
     trained = read_trained(run)
     s = trained.policy.settings
     if trained.scene is None or (trained.policy.observer is None and _needs_cloud(trained)):
@@ -88,8 +99,8 @@ def find_checkpoint(path: Path, n_action_steps: int | None = None) -> Checkpoint
 
 def find_checkpoints(run: Path, n_action_steps: int | None = None) -> list[CheckpointRef]:
     """Every checkpoint of a run, oldest first. Raises what :func:`find_checkpoint` does."""
-    newest_checkpoint(run)
-    return [find_checkpoint(path, n_action_steps) for path in sorted((run / CHECKPOINTS).glob("step-*.safetensors"))]
+    warn_of_lost_checkpoints(run)
+    return [find_checkpoint(path, n_action_steps) for path in all_checkpoints(run)]
 
 
 def common_tasks(checkpoints: Sequence[CheckpointRef], asked: Sequence[str] = ()) -> tuple[str, ...]:

@@ -10,8 +10,17 @@ from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
-from flowlab.policies.checkpoint import CHECKPOINTS, POLICY, RUN, build_policy, load_policy, read_trained
-from flowlab.policies.run_folder import RESUME, has_begun, lines_behind, read_resume, read_run_config
+from flowlab.policies.checkpoint import (
+    POLICY,
+    RESUME,
+    RUN,
+    build_policy,
+    checkpoint_files,
+    load_policy,
+    read_trained,
+    warn_of_lost_checkpoints,
+)
+from flowlab.policies.run_folder import has_begun, lines_behind, read_resume, read_run_config
 from flowlab.storage.validation import Finding, finding_of
 from flowlab.training.metrics import METRICS
 from flowlab.untrusted import is_there, read_json
@@ -28,8 +37,9 @@ def validate_run(path: Path) -> Iterator[Finding]:
 
     The policy must be installed here, as for its use.
     """
+    warn_of_lost_checkpoints(path)
     checks: list[Callable[[], None]] = [lambda: _check_begun(path), lambda: _check_plan(path)]
-    checks += [lambda w=w: _check_checkpoint(w) for w in sorted((path / CHECKPOINTS).glob("step-*.safetensors"))]  # type: ignore[misc]
+    checks += [lambda w=w: _check_checkpoint(w) for w in checkpoint_files(path)]  # type: ignore[misc]
     checks += [lambda: _check_resume(path), lambda: _check_metrics(path)]
     checks += [lambda e=e: _check_episodes(e) for e in sorted((path / FOLDER).glob(f"*/{EPISODES}"))]  # type: ignore[misc]
     seen = set()

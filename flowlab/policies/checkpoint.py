@@ -1,6 +1,7 @@
 """A policy on disk: what it is (``policy.json``), and its weights (safetensors), as a training run keeps them."""
 
 import json
+import logging
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -32,7 +33,10 @@ from flowlab.version import __version__
 
 POLICY = "policy.json"
 RUN = "run.json"
+RESUME = "resume.safetensors"
 CHECKPOINTS = "checkpoints"
+_CHECKPOINT_NAME = re.compile(r"step-\d{8}\.safetensors")
+_LOG = logging.getLogger(__name__)
 _ADVICE = "delete it to use the checkpoint before it"
 _RESTORE = "restore it from a copy, or train anew into another --out"
 FREE = ("dataset",)
@@ -93,11 +97,14 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     Raises:
         DataError: There is none, it is damaged, or its policy is not installed here.
     """
-    weights = path if path.suffix == ".safetensors" else newest_checkpoint(path)
+    weights = path
+    if path.suffix != ".safetensors":
+        warn_of_lost_checkpoints(path)
+        weights = newest_checkpoint(path)
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
     tensors, step = read_run_tensors(weights, folder, _ADVICE)
-    if re.fullmatch(r"step-\d{8}\.safetensors", weights.name) and weights.name != _checkpoint_name(step):
+    if _CHECKPOINT_NAME.fullmatch(weights.name) and weights.name != _checkpoint_name(step):
         raise DataError(f"{weights}: holds the weights after {step} steps; restore it, or call it after them")
     policy = build_policy(trained.policy, tensors, f"{weights}: does not fit {folder / POLICY}")
     return LoadedPolicy(policy.requires_grad_(False).eval().to(device), trained, step, weights)
@@ -127,11 +134,35 @@ def build_policy(spec: PolicySpec, tensors: Mapping[str, Tensor], misfit: str) -
 
 def newest_checkpoint(run: Path) -> Path:
     """The weights of a run that have seen most steps. Raises :class:`DataError` where there are none."""
+    return all_checkpoints(run)[-1]
+
+
+def all_checkpoints(run: Path) -> list[Path]:
+    """The weights of a run, those that have seen fewest steps first. Raises :class:`DataError` where there are none."""
     read_trained(run)
-    checkpoints = sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
+    checkpoints = checkpoint_files(run)
     if not checkpoints:
         raise DataError(f"{run}: has no checkpoint yet; resume it with 'flowlab train {run} --resume'")
-    return checkpoints[-1]
+    return checkpoints
+
+
+def checkpoint_files(run: Path) -> list[Path]:
+    """The weights that are there, those that have seen fewest steps first."""
+    return sorted((run / CHECKPOINTS).glob("step-*.safetensors"))
+
+
+def warn_of_lost_checkpoints(run: Path) -> None:
+    """Say which checkpoints there were when the run was last saved, and are no longer: others would pass for them."""
+    path = run / RESUME
+    known: Any = None
+    with suppress(DataError), understood(path, ""), safetensors.safe_open(path, "pt") as file:
+        known = metadata_of(file, str(path), "").get("checkpoints")
+    names = map(str, known if isinstance(known, list) else ())  # a damaged resume file is told by who resumes
+    lost = set(filter(_CHECKPOINT_NAME.fullmatch, names)) - {weights.name for weights in checkpoint_files(run)}
+    if lost:
+        _LOG.warning(
+            "flowlab: %s: there were weights called %s, and are no longer", run / CHECKPOINTS, ", ".join(sorted(lost))
+        )
 
 
 def step_of(weights: Path) -> int:

@@ -1,4 +1,8 @@
-"""3D Flow Diffusion Policy: predicts how points of the scene will move before the action."""
+"""3D Flow Diffusion Policy: predicts how points of the scene will move before the action.
+
+Its loss is that of the action and that of the flow (``policies/diffusion_policy.py``), each point of which has the
+weight that its quality gives it (``data/batch_builder.py``); the heads that predict flow are in ``nets/motion.py``.
+"""
 
 from typing import Literal
 

@@ -13,11 +13,12 @@ from flowlab.config import Settings
 from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers, write_json
 from flowlab.policies.checkpoint import (
-    CHECKPOINTS,
     FREE,
     POLICY,
+    RESUME,
     RUN,
     TrainedPolicy,
+    checkpoint_files,
     identity,
     identity_in,
     read_run_tensors,
@@ -26,7 +27,6 @@ from flowlab.policies.checkpoint import (
 )
 from flowlab.policies.tensor_files import write_tensors
 
-RESUME = "resume.safetensors"
 Groups = Mapping[str, Mapping[str, Tensor]]
 """Tensors by group and name."""
 
@@ -85,7 +85,7 @@ def lines_behind(groups: Groups) -> int:
 
 def has_begun(folder: Path) -> bool:
     """Whether a folder holds a run that can go on, or has come to its end; not what a kill left of a beginning."""
-    kept = (folder / RESUME).exists() or any((folder / CHECKPOINTS).glob("step-*.safetensors"))
+    kept = (folder / RESUME).exists() or any(checkpoint_files(folder))
     return kept and (folder / POLICY).exists()
 
 
@@ -105,7 +105,7 @@ def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig, groups: G
         raise UsageError(
             f"{folder}: holds a run already; go on with 'flowlab train {folder} --resume', or choose another --out"
         )
-    if any((folder / CHECKPOINTS).glob("step-*")):
+    if checkpoint_files(folder):
         raise UsageError(f"{folder}: holds checkpoints, but no {POLICY} that says of what; choose another --out")
     about = with_checksum(json.loads(trained.model_dump_json()))
     plan = with_checksum(json.loads(run.model_dump_json()), FREE)
@@ -120,4 +120,6 @@ def start_folder(folder: Path, trained: TrainedPolicy, run: RunConfig, groups: G
 
 def _write_resume(folder: Path, step: int, groups: Groups, policy: str, run: str) -> None:
     tensors = {f"{group}:{name}": value for group, values in groups.items() for name, value in values.items()}
-    write_tensors(folder / RESUME, tensors, {"step": step, "policy": policy, "run": run})
+    checkpoints = [path.name for path in checkpoint_files(folder)]
+    about = {"step": step, "policy": policy, "run": run, "checkpoints": checkpoints}
+    write_tensors(folder / RESUME, tensors, about)

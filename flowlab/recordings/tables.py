@@ -27,6 +27,12 @@ _UNITS = {
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
     "nanoseconds": 1e-9, "nanos": 1e-9,
 }  # fmt: skip
+_PARTS = {
+    "ns": 1e-9, "nsec": 1e-9, "nsecs": 1e-9, "nanosec": 1e-9, "nanosecs": 1e-9, "nanoseconds": 1e-9, "us": 1e-6,
+    "usec": 1e-6, "usecs": 1e-6, "microsec": 1e-6, "microsecs": 1e-6, "microseconds": 1e-6,
+}  # fmt: skip
+"""What the part below a second is called where it has a column of its own, as in ROS' stamps and in ``timeval``."""
+_WHOLE = {"s", "sec", "secs", "seconds"}
 _UNIT = re.compile(
     rf"[\s_\[\](){{}}/.:-]+({'|'.join(sorted(_UNITS, key=len, reverse=True))})[\])}}\s]*$", re.IGNORECASE
 )
@@ -177,18 +183,45 @@ def find_columns(
     Raises:
         DataError: Columns that are chosen do not exist, or it is not clear which are meant.
     """
+    pair = _whole_and_part(table)
     times = [k for k, n in enumerate(table.names) if base_and_unit(n)[0] in _TIMES]
-    rest = [k for k in range(table.values.shape[1]) if k not in times[:1]]
+    times = [*pair[:1], *(k for k in times if k not in pair)]
+    rest = [k for k in range(table.values.shape[1]) if k not in times[:1] and k not in pair]
     if chosen is not None:
         rest = [table.column(n) for n in chosen]
     if chosen is None or table.text & set(rest):
         _check_meaning(table, name, rest, times, color_s, timed)
     names = tuple(table.names[k] for k in rest) if table.names else ()
     time, known = None, False
-    if times:
+    if pair:
+        whole, part = pair
+        known, time = True, table.values[:, whole] + table.values[:, part] * _PARTS[_last_word(table.names[part])[1]]
+    elif times:
         scale = _scale(table, times[0])
         known, time = scale is not None, table.values[:, times[0]] * (1.0 if scale is None else scale)
     return Columns(time, known, names, table.values[:, rest])
+
+
+def _whole_and_part(table: SampleTable) -> tuple[int, ...]:
+    """The columns of the whole seconds of a time and of the part below a second; empty where there are none.
+
+    They are called the same but for their last word, and no part is a second or more.
+    """
+    words = [_last_word(name) for name in table.names]
+    for part, (start, word) in enumerate(words):
+        if word not in _PARTS:
+            continue
+        whole = [k for k, (other, w) in enumerate(words) if w in _WHOLE and other == start]
+        numbers = table.values[:, [*whole[:1], part]]
+        if len(whole) == 1 and (numbers % 1 == 0).all() and (numbers[:, 1] // (1 / _PARTS[word]) == 0).all():
+            return whole[0], part
+    return ()
+
+
+def _last_word(name: str) -> tuple[str, str]:
+    """The last word of a name, and what comes before it, in small letters."""
+    start, word = re.fullmatch(r"(.*?)([a-z]*)[^a-z]*", name.lower(), re.DOTALL).groups()  # type: ignore[union-attr]
+    return start, word
 
 
 def _check_meaning(
@@ -196,6 +229,7 @@ def _check_meaning(
 ) -> None:
     """Refuse columns that are no numbers of a robot, or may be none, with what to write."""
     doubtful = dict.fromkeys(times[1:], "is a time, too")
+    doubtful |= {k: "is a part of a time" for k in rest if table.names and _plain(table.names[k]) in _PARTS}
     doubtful |= {k: "holds text" for k in rest if k in table.text}
     doubtful |= {k: "counts the rows" for k in rest if table.names and _plain(table.names[k]) in _COUNTS
                  and _rises(table.values[:, k])}  # fmt: skip

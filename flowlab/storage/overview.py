@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import unit_shard
 from flowlab.storage.receipts import StageTally
-from flowlab.storage.shard_arrays import StoredArray
+from flowlab.storage.stored_array import StoredArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,8 @@ from flowlab.files import new_file
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
 from flowlab.storage.schema import EPISODE_ENDS, POSES, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
-from flowlab.storage.shard_arrays import StoredArray, stored_array
 from flowlab.storage.shard_files import open_files, write_zip
+from flowlab.storage.stored_array import StoredArray, stored_array
 from flowlab.text import shown
 from flowlab.untrusted import parse_json
 

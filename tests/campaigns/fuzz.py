@@ -107,7 +107,7 @@ def _child(kind: Kind, sample: Path, seed: int, indices: range, scratch: Path, p
     """Do some inputs, and tell what came of each through a pipe."""
     watch = Watch(scratch)
     os.chdir(scratch)
-    os.environ.update(HOME=str(scratch), XDG_CACHE_HOME=str(scratch / "cache"), TMPDIR=str(scratch))
+    os.environ.update(HOME=str(scratch), FLOWLAB_CACHE=str(scratch / "cache"), TMPDIR=str(scratch))
     tempfile.tempdir = str(scratch)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, used + _MEMORY))

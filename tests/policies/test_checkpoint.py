@@ -190,6 +190,20 @@ def test_a_checkpoint_under_the_name_of_another_is_refused(run: Path, tmp_path: 
         load_policy(tmp_path / "run")
 
 
+def test_other_weights_do_not_pass_for_lost_ones_in_silence(
+    run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    *_, before, last = sorted((tmp_path / "run/checkpoints").iterdir())
+    last.unlink()
+    assert load_policy(tmp_path / "run").path == before
+    told = f"flowlab: {tmp_path / 'run/checkpoints'}: there were weights called {last.name}, and are no longer"
+    assert caplog.messages == [told]
+    (tmp_path / "run/resume.safetensors").unlink()  # whoever is done with training may delete it
+    load_policy(tmp_path / "run")
+    assert caplog.messages == [told]
+
+
 def rewrite(path: Path, values: dict[str, Any]) -> None:
     """Write a run's JSON with the digest of its content, as somebody might who means it."""
     path.write_text(json.dumps(with_checksum({k: v for k, v in values.items() if k != "sha256"})))

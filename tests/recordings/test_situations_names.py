@@ -18,6 +18,11 @@ CLOCK = np.arange(STEPS) / 10
 ROWS = [(f"{1.7e9 + t:.1f}", f"{t * t}", f"{1 - t}") for t in CLOCK]
 
 
+def in_two(part_s: float) -> list[tuple[str, ...]]:
+    """The rows with their times as whole seconds and a part below one."""
+    return [(t.partition(".")[0], f"{(float(t) % 1) / part_s:.0f}", *rest) for t, *rest in ROWS]
+
+
 def table(header: str, sep: str = ",", rows: list[tuple[str, ...]] = ROWS) -> str:
     return "\n".join([header, *(sep.join(row) for row in rows)]) + "\n"
 
@@ -32,6 +37,9 @@ def table(header: str, sep: str = ",", rows: list[tuple[str, ...]] = ROWS) -> st
         (table('"time","x","y"'), 1.0),
         (table("time [ms];x;y", ";", [tuple(c.replace(".", ",") for c in row) for row in ROWS]), 1e-3),
         (table("%time,x,y", rows=[(str(int(float(t) * 1e9)), *rest) for t, *rest in ROWS]), 1e-9),
+        (table("secs,nsecs,x,y", rows=in_two(1e-9)), 1.0),
+        (table("header.stamp.sec,header.stamp.nanosec,x,y", rows=in_two(1e-9)), 1.0),
+        (table("x,y,tv_sec,tv_usec", rows=[(*row[2:], *row[:2]) for row in in_two(1e-6)]), 1.0),
     ],
 )
 def test_times_are_found_by_name_and_unit(text: str, unit_s: float) -> None:
@@ -51,6 +59,7 @@ def test_times_are_found_by_name_and_unit(text: str, unit_s: float) -> None:
         ("1,234;5,678\n2,345;6,789\n", "'1,234' may have a decimal comma or a sign between thousands"),
         ("0,10, 1,25\n", "commas within its numbers"),
         ("time,stamp,x\n1,2,3\n", r"column 'stamp' is a time, too; .*\['x'\]"),
+        (table("secs,nsecs,x", rows=[("1", "2000000000", "3")]), r"column 'nsecs' is a part of a time; .*\['x'\]"),
         ("x,arm\n1,left\n2,left\n", r"column 'arm' holds text; .*\['x'\]"),
     ],
 )
