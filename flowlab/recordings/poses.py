@@ -189,7 +189,8 @@ def most_apart_s(color: ImageStream, stated: float | None) -> float:
 def check_known(poses: SampleStream, known: Bool[np.ndarray, "F"], apart_s: float) -> Check:
     """In how many frames the pose is known, and by which poses."""
     says = (f"{len(poses.time_s)} from {poses.name}, {sampling_rate(poses.time_s):.3g} a second, tell where the "
-            f"camera is in {known.sum()} of {len(known)} frames, between poses at most {1000 * apart_s:.0f} ms apart")  # fmt: skip
+            f"camera is in {known.sum()} of {len(known)} frames, "
+            f"between poses at most {1000 * apart_s:.0f} ms apart")  # fmt: skip
     if known.all():
         return Check(ABOUT, Verdict.OK, says)
     says += "; the others are left out: 'T_world_cam_gap_s' says how far apart poses may be"
