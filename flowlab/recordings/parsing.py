@@ -134,13 +134,14 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     """Read the streams, find out what is known of them, and look at every picture."""
     reader = choose_reader(path, settings.reader)
     given = list(_given(path, settings))
-    streams = read_streams(reader, path, combine(given)[0])
+    said = combine(given)[0]
+    streams = read_streams(reader, path, said)
     for stream in (streams.color, streams.depth):
         if not len(stream):
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
     metadata, origin = combine([*given, *streams.known])
     try:
-        streams = without_saturated(put_on_one_clock(_with_files(path, streams, metadata), metadata))
+        streams = without_saturated(put_on_one_clock(_with_files(path, streams, metadata, said), metadata))
     except UnclearStamps as error:
         raise DataError(f"{path}: clock: {error}; all this goes into {_write_to(path)}") from error
     seen = check_frames(
@@ -175,7 +176,7 @@ def _given(path: Path, settings: RecordingSettings) -> Iterator[tuple[str, Metad
             yield file.name, load_metadata(file)
 
 
-def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
+def _with_files(path: Path, streams: Streams, metadata: Metadata, said: Metadata) -> Streams:
     """The streams, with state and actions from files where ``recording.yaml`` names some."""
     folder = path if path.is_dir() else path.parent
     changed: dict[str, Any] = {}
@@ -190,21 +191,21 @@ def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
         times = metadata.T_world_cam_times
         where = None if times is None else folder / times
         changed["poses"] = load_poses(folder / metadata.T_world_cam_file, where, streams.color)
-    return _with_one_pose(path, replace(streams, **changed), metadata)
+    return _with_one_pose(path, replace(streams, **changed), said)
 
 
-def _with_one_pose(path: Path, streams: Streams, metadata: Metadata) -> Streams:
+def _with_one_pose(path: Path, streams: Streams, said: Metadata) -> Streams:
     """The same streams, whose poses are not contradicted. Raises :class:`DataError` where they are."""
-    if metadata.T_world_cam_file is not None and metadata.T_world_cam is not None:
+    if said.T_world_cam_file is not None and said.T_world_cam is not None:
         raise DataError(f"{path}: T_world_cam says that the camera stands still, and T_world_cam_file that it moves; "
                         f"leave one of them out of {_write_to(path)}")  # fmt: skip
     if streams.poses is None:
-        said = [f"T_world_cam_{x}" for x in ("times", "offset_s", "gap_s") if getattr(metadata, f"T_world_cam_{x}")]
-        if said:
-            raise DataError(f"{path}: '{said[0]}' is said, but there are no poses that it could be said of; name them "
-                            f"with 'T_world_cam_file' in {_write_to(path)}")  # fmt: skip
+        of_poses = [f"T_world_cam_{x}" for x in ("times", "offset_s", "gap_s") if getattr(said, f"T_world_cam_{x}")]
+        if of_poses:
+            raise DataError(f"{path}: '{of_poses[0]}' is said, but there are no poses that it could be said of; name "
+                            f"them with 'T_world_cam_file' in {_write_to(path)}")  # fmt: skip
         return streams
-    if metadata.T_world_cam is None:
+    if said.T_world_cam is None:
         return streams
     says = (f"{streams.poses.name} has {len(streams.poses.values)} poses of it, which are not used, since "
             "T_world_cam says where it stands still; leave that out to use them")  # fmt: skip

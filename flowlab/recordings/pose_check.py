@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 
 _STARTS = 8
 """So many rows, evenly spread, are compared with later ones."""
-_LAGS_S = (0.1, 0.4)
-"""How much later those are [s]."""
+_SOON_S, _LATEST_S = 0.1, 6.0
+"""How much later those are at least and at most [s]."""
+_FAR_PX = 0.04
+"""Share of the width that the picture moves by in between."""
 _WIDTH = 320
 _LEAST_SIDE = 24
-_ENOUGH = 30
-"""Points that two rows both show."""
+_ENOUGH = 0.05
+"""Share of the pixels that two rows must both show."""
 _THERE_AND_BACK_PX = 0.7
 """Flow that does not come back to within this is not believed, in pixels of small pictures."""
 _TEXTURE = 2.0
@@ -63,6 +65,10 @@ class _Pair:
     rows: tuple[int, int]
     first: Float64[np.ndarray, "N 3"]
     second: Float64[np.ndarray, "N 3"]
+    px: float
+    """How far they move in the picture, in the median [px]."""
+    width: int
+    """Of the picture [px]."""
 
     def off_m(self, T: Float[np.ndarray, "T 4 4"]) -> float:
         """How far apart they are in the world, in the median."""
@@ -137,23 +143,35 @@ def _pairs(source: "ParsedRecording") -> Iterator[_Pair]:
     except DataError:  # which is told elsewhere
         return
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    for rows in _rows(source):
+    clock = source.streams.color.time_s[source.frame_check.color]
+    for start in np.unique(np.linspace(0, len(clock) - 1, _STARTS + 1).astype(int))[:-1].tolist():
         try:
-            one, other = (_taken(source, processor, row) for row in rows)
+            pair = _farthest(source, processor, flow, start, clock)
         except BadImage:
             continue
-        pair = _matched(flow, rows, one, other)
         if pair is not None:
             yield pair
 
 
-def _rows(source: "ParsedRecording") -> list[tuple[int, int]]:
-    """Rows to compare: evenly spread ones, each with one soon after it and one later."""
-    clock = source.streams.color.time_s[source.frame_check.color]
-    starts = np.unique(np.linspace(0, len(clock) - 1, _STARTS).astype(int))
-    after = [np.searchsorted(clock, clock[starts] + lag - 1e-6) for lag in _LAGS_S]
-    pairs = {(int(a), max(int(b), int(a) + 1)) for ends in after for a, b in zip(starts, ends, strict=True)}
-    return sorted((a, b) for a, b in pairs if b < len(clock))
+def _farthest(
+    source: "ParsedRecording", processor: FrameProcessor, flow: "cv2.DISOpticalFlow", start: int, clock: np.ndarray
+) -> _Pair | None:
+    """A row with one so much later that the picture has moved as far as flow can follow, by its speed at the row."""
+    one = _taken(source, processor, start)
+    soon = _row_at(clock, start, _SOON_S)
+    near = _matched(flow, (start, soon), one, _taken(source, processor, soon))
+    if near is None:
+        return None
+    lag = (clock[soon] - clock[start]) * _FAR_PX * near.width / max(near.px, 1e-6)
+    row = _row_at(clock, start, min(lag, _LATEST_S))
+    far = _matched(flow, (start, row), one, _taken(source, processor, row)) if row > soon else None
+    return far or near
+
+
+def _row_at(clock: Float64[np.ndarray, "T"], start: int, lag_s: float) -> int:
+    """The last row up to so much later, but the next at least."""
+    row = int(np.searchsorted(clock, clock[start] + lag_s + 1e-6, side="right")) - 1
+    return min(max(row, start + 1), len(clock) - 1)
 
 
 _Taken = tuple[np.ndarray, np.ndarray]
@@ -191,7 +209,10 @@ def _matched(flow: "cv2.DISOpticalFlow", rows: tuple[int, int], one: _Taken, oth
     edges = [np.ptp(_around(p[..., 2]), axis=0) > _EDGE * p[..., 2] for p in (points_a, points_b)]
     beside = cv2.remap(edges[1].astype(np.uint8), to_u, to_v, cv2.INTER_NEAREST, borderValue=1)
     good &= ~edges[0] & (beside == 0) & np.isfinite(points_a).all(-1) & np.isfinite(second).all(-1)
-    return _Pair(rows, points_a[good], second[good]) if good.sum() >= _ENOUGH else None
+    if good.sum() < _ENOUGH * good.size:
+        return None
+    px = float(np.median(np.linalg.norm(there[good], axis=-1)))
+    return _Pair(rows, points_a[good], second[good], px, a.shape[1])
 
 
 def _around(z: np.ndarray) -> np.ndarray:
