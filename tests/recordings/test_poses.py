@@ -250,6 +250,16 @@ def test_poses_that_are_not_the_cameras_are_refused(
     assert code == (3 if verdict == "refused" else 0), problem
 
 
+@pytest.mark.parametrize(("read", "code", "verdict"), [(lambda T: T, 0, "ok"), (inverse, 3, "refused")])
+def test_poses_of_a_slow_camera_are_tested_over_longer(
+    tmp_path: Path, capsys: Capture, read: Callable[[np.ndarray], np.ndarray], code: int, verdict: str
+) -> None:
+    T = np.stack([looking((0.012 * t, -0.85, 0.65), (0.012 * t, 0.1, 0.05)) for t in range(24)])
+    shots = [film((TABLE, WALL, FLOOR, *THINGS), K, SIZE, one, seed=k) for k, one in enumerate(T)]
+    found = dry_run(capsys, put(tmp_path / "r", shots, read(T)))
+    assert (found[0], found[1]["camera"][0]) == (code, verdict), found[1]["camera"]
+
+
 def test_poses_of_another_clock_are_shifted_as_said(frames: Frames, tmp_path: Path, capsys: Capture) -> None:
     own = np.arange(-0.5, CLOCK[-1] + 0.5, 0.02)
     path = put(tmp_path / "r", frames, T_world_cam_file="T.txt", time_unit="s", times="times.txt", fps=None)
