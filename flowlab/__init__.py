@@ -12,6 +12,7 @@ os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", "")
 
 if TYPE_CHECKING:
     from flowlab import data
+    from flowlab.demonstrations import Demonstration
     from flowlab.deployment.robot_policy import Policy
     from flowlab.errors import (
         DataError,
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from flowlab.records import (
         Clip,
         Cloud,
-        Demonstration,
         Entity,
         Episode,
         FlowPrediction,
@@ -59,10 +59,11 @@ _LAZY = {
     "PolicyResult": "flowlab.evaluation.results",
     "Policy": "flowlab.deployment.robot_policy",
     "Camera": "flowlab.geometry.camera",
+    "Demonstration": "flowlab.demonstrations",
     **dict.fromkeys(
         (
-            "Clip", "Cloud", "Demonstration", "Entity", "Episode", "FlowPrediction", "Frame", "Observation",
-            "PositionSource", "Quality", "Queries", "Role", "Tracks2D", "Tracks3D",
+            "Clip", "Cloud", "Entity", "Episode", "FlowPrediction", "Frame", "Observation", "PositionSource",
+            "Quality", "Queries", "Role", "Tracks2D", "Tracks3D",
         ),
         "flowlab.records",
     ),

@@ -2,12 +2,11 @@
 
     Frame -> Cloud -> Observation -> Queries -> Tracks2D (real only) -> Tracks3D -> Episode -> shard
 
-A real recording and a simulated rollout are both a :class:`Demonstration`; they differ only in how
-tracks are made. World coordinates are meters in the dataset's world frame, which ``docs/conventions.md``
+A real recording and a simulated rollout are both a :class:`~flowlab.demonstrations.Demonstration`; they differ only
+in how tracks are made. World coordinates are meters in the dataset's world frame, which ``docs/conventions.md``
 describes; float32 unless said otherwise.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -121,9 +120,45 @@ class Clip(Record):
     depth: Float32[np.ndarray, "T H W"]
     """z-depth [m], registered to the color picture; 0 where there is no reading."""
     camera: Camera
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    """See :class:`~flowlab.demonstrations.Demonstration`."""
 
     def __len__(self) -> int:
         return len(self.rgb)
+
+    def poses(self) -> Float64[np.ndarray, "T 4 4"]:
+        """The pose of the camera in every frame.
+
+        Returns:
+            Maps the camera's coordinates to the world's [m], whether it moves or not.
+        """
+        if self.T_world_cam is not None:
+            return self.T_world_cam
+        return np.broadcast_to(np.asarray(self.camera.T_world_cam, float), (len(self), 4, 4))
+
+    def to_world(self, xyz_cam: Float[np.ndarray, "T M 3"]) -> Float[np.ndarray, "T M 3"]:
+        """Points of every frame in the world.
+
+        Args:
+            xyz_cam: Points in the camera's frame of each row [m].
+
+        Returns:
+            The same points in the world's frame [m].
+        """
+        T = self.poses()
+        return xyz_cam @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
+
+    def to_camera(self, xyz_world: Float[np.ndarray, "T M 3"]) -> Float[np.ndarray, "T M 3"]:
+        """Points of every frame in the camera's frame: the inverse of :meth:`to_world`.
+
+        Args:
+            xyz_world: Points in the world's frame [m].
+
+        Returns:
+            The same points in the camera's frame of each row [m].
+        """
+        T = self.poses()
+        return (xyz_world - T[:, None, :3, 3]) @ T[:, :3, :3]
 
     def _check_values(self) -> None:
         if self.depth.size and (least := np.nanmin(self.depth)) < 0:
@@ -212,78 +247,10 @@ class Tracks3D(Record):
     """None for exact tracks."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Demonstration(Record, ABC):
-    """A demonstration one can look at: a simulated rollout, or a recording of a real robot."""
-
-    task: str
-    seed: int
-    camera: Camera
-    time_s: Float64[np.ndarray, "T"]
-    """When each row was, since the first [s]."""
-    state: Float32[np.ndarray, "T S"]
-    action: Float32[np.ndarray, "T A"]
-    """The action taken after the observation of the same row, as executed."""
-    success: Bool[np.ndarray, "T"]
-    """Whether the task counts as solved after the action of the same row."""
-    object_pose: Float32[np.ndarray, "T 9"] | None = None
-    """Position [m] and 6D rotation of the manipulated body, where it is known."""
-    extras: Mapping[str, Any] = field(default_factory=dict)
-    """Small JSON values of where it comes from, such as MetaWorld's ``rand_vec``."""
-
-    def __len__(self) -> int:
-        return len(self.action)
-
-    def _check_values(self) -> None:
-        _check_rows(self)
-
-    @abstractmethod
-    def frame(self, t: int) -> Frame:
-        """The picture taken at step ``t``, before action ``t``.
-
-        Args:
-            t: The step, from 0.
-
-        Returns:
-            Depth [m], and color and owners where they are known.
-        """
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class ObservedDemo(Record):
-    """A demonstration, and what the Observer saw of it."""
-
-    demo: Demonstration
-    points_world: Float32[np.ndarray, "T N 3"]
-    point_count: Int32[np.ndarray, "T"]
-    first_cloud: Cloud
-    depth: Float32[np.ndarray, "T H W"]
-    owner: Int16[np.ndarray, "T H W"] | None = None
-    rgb: UInt8[np.ndarray, "T H W 3"] | None = None
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class QueriedDemo(Record):
-    """An observed demonstration, and the points to follow through it."""
-
-    observed: ObservedDemo
-    queries: Queries
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class TrackedDemo(Record):
-    """A demonstration whose query points have been followed in the picture."""
-
-    queried: QueriedDemo
-    tracks: Tracks2D
-    tracker: Mapping[str, Any]
-    """Name, license and version of the tracker, and what weights it used."""
-
-
 @dataclass(frozen=True, slots=True, repr=False)
 class Episode(Record):
     """One labeled demonstration, as it is stored. Row t of every array is the same instant; fields that a
-    :class:`Demonstration` has too mean the same."""
+    :class:`~flowlab.demonstrations.Demonstration` has too mean the same."""
 
     task: str
     seed: int
@@ -300,9 +267,21 @@ class Episode(Record):
     depth: Float32[np.ndarray, "T H W"] | None = None
     rgb: UInt8[np.ndarray, "T H W 3"] | None = None
     extras: Mapping[str, Any] = field(default_factory=dict)
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
 
     def __len__(self) -> int:
         return len(self.action)
+
+    def camera_at(self, t: int) -> Camera:
+        """The camera as it was at step ``t``.
+
+        Args:
+            t: The step, from 0.
+
+        Returns:
+            ``camera``, where it stands still.
+        """
+        return camera_at(self, t)
 
     def check_numbers(self) -> None:
         """Refuse what nobody may store. An episode that is read may have it: a damaged dataset has to be looked into.
@@ -310,7 +289,7 @@ class Episode(Record):
         Raises:
             RecordError: Times do not rise, numbers of the robot are not finite, or counts cannot be.
         """
-        _check_rows(self)
+        check_rows(self)
         low, high, most = self.point_count.min(initial=0), self.point_count.max(initial=0), self.point_cloud.shape[1]
         if not 0 <= low <= high <= most:
             raise self._wrong("point_count", f"ranges from {low} to {high}, expected 0 to {most}")
@@ -327,8 +306,13 @@ class Episode(Record):
         return roles[self.queries.owner]
 
 
-def _check_rows(of: Demonstration | Episode) -> None:
-    """Refuse times that do not rise, and numbers of the robot that are none."""
+def camera_at(of: Any, t: int) -> Camera:
+    """The camera at a row of an episode or a demonstration."""
+    return of.camera if of.T_world_cam is None else of.camera.at(of.T_world_cam[t])
+
+
+def check_rows(of: Any) -> None:
+    """Of an episode or a demonstration, refuse times that do not rise, and numbers of the robot that are none."""
     for name in ("time_s", "state", "action"):
         if not np.isfinite(values := getattr(of, name)).all():
             raise of._wrong(name, f"is not finite in row {int(np.argwhere(~np.isfinite(values))[0][0])}")

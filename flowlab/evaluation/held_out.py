@@ -23,8 +23,8 @@ class HeldOut:
 
     dataset: Path
     buffer: ReplayBuffer
-    cameras: tuple[Camera, ...] | None
-    """Of every demonstration; None where the dataset has none."""
+    cameras: tuple[Camera | None, ...] | None
+    """Of every demonstration, None for one that moves; None where the dataset has none."""
 
 
 def open_held_out(loaded: LoadedPolicy, data: Path | None = None) -> HeldOut:
@@ -128,8 +128,8 @@ def _select(buffer: ReplayBuffer, demos: Sequence[int]) -> ReplayBuffer:
     return replace(buffer, episodes=tuple(buffer.episodes[k] for k in demos), **mine)
 
 
-def _cameras(path: Path, buffer: ReplayBuffer) -> tuple[Camera, ...]:
-    """The camera of every demonstration: a simulated dataset's, or its recording's."""
+def _cameras(path: Path, buffer: ReplayBuffer) -> tuple[Camera | None, ...]:
+    """The camera of every demonstration that has one for all of its rows: a simulated dataset's, or its recording's."""
     shards = {(r.task, r.seed): r.shard for r in Dataset(path).refs}
-    attributes = {shard: Shard(path / shard).attributes for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
-    return tuple(Camera.from_json(attributes[shards[d.task, d.seed]].camera) for d in buffer.episodes)
+    cameras = {shard: Shard(path / shard).camera for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
+    return tuple(cameras[shards[d.task, d.seed]] for d in buffer.episodes)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32
 
+from flowlab.demonstrations import ObservedDemo, QueriedDemo
 from flowlab.errors import MissingLibraryError
 from flowlab.evaluation.checkpoints import CheckpointRef
 from flowlab.evaluation.results import EpisodeResult
@@ -15,7 +16,7 @@ from flowlab.pipeline.stages.labeled import labeled
 from flowlab.pipeline.stages.observe import ObserverStage
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
-from flowlab.records import Episode, FlowPrediction, ObservedDemo, QueriedDemo, Queries
+from flowlab.records import Episode, FlowPrediction, Queries
 from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
 from flowlab.sim.scene_settings import SceneSettings

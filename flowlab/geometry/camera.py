@@ -1,7 +1,7 @@
 """The pinhole camera, in OpenCV's convention."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,20 @@ GL_TO_CV = np.diag([1.0, -1.0, -1.0])
 """OpenGL's cameras, and MuJoCo's, look along -z with y up."""
 _ROTATION_TOLERANCE = 1e-3
 """So much may a rotation times its transpose differ from the identity: what rounding to three digits does."""
+
+
+def pose_fault(T: Float[np.ndarray, "4 4"]) -> str:
+    """Why a matrix is no pose, in words that follow the name of it; empty where it is one."""
+    R, last = T[:3, :3], T[3]
+    if not np.isfinite(T).all():
+        return "holds a number that is not finite"
+    if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:
+        return f"has the last row {last.tolist()}, expected [0, 0, 0, 1]"
+    off = np.abs(R @ R.T - np.eye(3)).max()
+    if off > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        what = f"is off by {off:.2g}" if off > _ROTATION_TOLERANCE else "mirrors"
+        return f"holds no rotation (it {what}), expected columns that are right-handed axes"
+    return ""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -53,26 +67,26 @@ class Camera(Record):
         for name in ("width", "height"):
             if not getattr(self, name) > 0:
                 raise self._wrong(name, f"is {getattr(self, name)}, expected a number of pixels above 0")
-        for name in ("K", "T_world_cam"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise self._wrong(name, "holds a number that is not finite")
+        if not np.isfinite(self.K).all():
+            raise self._wrong("K", "holds a number that is not finite")
         fx, skew, fy = self.K[0, 0], self.K[0, 1], self.K[1, 1]
         if not (fx > 0 and fy > 0):
             raise self._wrong("K", f"has the focal lengths {fx:g} and {fy:g}, expected pixels above 0")
         if not (np.abs(self.K[2] - [0, 0, 1]).max() < 1e-6 and abs(self.K[1, 0]) < 1e-6 and abs(skew) < 1e-3 * fx):
             raise self._wrong("K", f"is {self.K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-        self._check_pose()
+        if fault := pose_fault(self.T_world_cam):
+            raise self._wrong("T_world_cam", fault)
 
-    def _check_pose(self) -> None:
-        R, last = self.T_world_cam[:3, :3], self.T_world_cam[3]
-        if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:
-            raise self._wrong("T_world_cam", f"has the last row {last.tolist()}, expected [0, 0, 0, 1]")
-        off = np.abs(R @ R.T - np.eye(3)).max()
-        if off > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-            what = f"is off by {off:.2g}" if off > _ROTATION_TOLERANCE else "mirrors"
-            raise self._wrong(
-                "T_world_cam", f"holds no rotation (it {what}), expected columns that are right-handed axes"
-            )
+    def at(self, T_world_cam: Float[np.ndarray, "4 4"]) -> "Camera":
+        """The same camera elsewhere.
+
+        Args:
+            T_world_cam: Its pose there.
+
+        Returns:
+            The camera with that pose.
+        """
+        return replace(self, T_world_cam=T_world_cam)
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float, T_world_cam: np.ndarray) -> "Camera":

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float32
 
 from flowlab.errors import DataError
-from flowlab.geometry.transforms import apply, inverse
 from flowlab.grading import ground_truth
 from flowlab.grading.calibration import Calibration, calibrate
 from flowlab.grading.ground_truth import GroundTruth, unusable_queries
@@ -150,7 +149,7 @@ def read_clip(recording: Path) -> Clip:
     opened = open_recording(recording, settings, task=recording.name, seed=0)
     frames = [opened.frame(t) for t in range(len(opened))]
     rgb = np.stack([f.rgb for f in frames if f.rgb is not None])
-    return Clip(rgb, np.stack([f.depth for f in frames]), opened.camera)
+    return Clip(rgb, np.stack([f.depth for f in frames]), opened.camera, opened.T_world_cam)
 
 
 def label_blind(
@@ -162,7 +161,7 @@ def label_blind(
 ) -> EstimatedTracks:
     """The labeling's answer for pixels of the first frame, in the camera frame."""
     _, tracks = label_clip(clip, query_px, tracker, chunks, lifting)
-    xyz_cam = apply(inverse(clip.camera.T_world_cam), tracks.xyz_world.astype(np.float64)).astype(np.float32)
+    xyz_cam = clip.to_camera(tracks.xyz_world.astype(np.float64)).astype(np.float32)
     return EstimatedTracks(xyz_cam, tracks.visible, None if tracks.quality is None else tracks.quality.sigma)
 
 

@@ -9,9 +9,10 @@ from typing import Any, ClassVar, get_type_hints
 from pydantic import ValidationError
 
 from flowlab.config import Settings, explain
+from flowlab.demonstrations import Demonstration
 from flowlab.errors import FlowlabError, UsageError, first_line
 from flowlab.provenance import Provenance
-from flowlab.records import Demonstration, Episode
+from flowlab.records import Episode
 from flowlab.storage.receipts import StageTally
 from flowlab.text import shown
 

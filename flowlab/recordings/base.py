@@ -50,7 +50,7 @@ class SampleStream:
     name: str
     time_s: Float64[np.ndarray, "N"]
     """On the clock of the pictures [s]; from a reader in the unit that ``timing`` says."""
-    values: Float32[np.ndarray, "N D"]
+    values: Float32[np.ndarray, "N D"] | Float64[np.ndarray, "N D"]
     timing: Timing = IN_SECONDS
     """What is known of the times."""
     columns: tuple[str, ...] = field(default=(), kw_only=True)
@@ -80,6 +80,8 @@ class Streams:
     """What the reader looked at, and what came of it."""
     used: tuple[str, ...] | None = None
     """The files and folders below a recording that it is made of; None where the reader does not say."""
+    poses: SampleStream | None = None
+    """Of a color camera that moves, see :func:`flowlab.recordings.poses.pose_stream`."""
 
 
 @runtime_checkable
@@ -135,7 +137,8 @@ def read_streams(reader: Reader, path: Path, given: Metadata) -> Streams:
         raise DataError(f"{path}: the reader '{reader.name}' cannot read it ({_words(error)})") from error
     if not isinstance(streams, Streams):
         raise DataError(f"{path}: the reader '{reader.name}' gives {shown(streams)}, expected Streams")
-    every: tuple[Any, ...] = (streams.color, streams.depth, *streams.state, *streams.action)
+    poses = () if streams.poses is None else (streams.poses,)
+    every: tuple[Any, ...] = (streams.color, streams.depth, *streams.state, *streams.action, *poses)
     for stream in every:
         _check_stream(stream, f"{path}: the reader '{reader.name}'")
     return replace(streams, color=_guarded(streams.color), depth=_guarded(streams.depth))

@@ -7,6 +7,7 @@ from flowlab.recordings.camera_check import check_camera
 from flowlab.recordings.depth_unit_check import check_depth_unit
 from flowlab.recordings.left_out import check_widths_known, find_left_out
 from flowlab.recordings.motion_check import check_motion
+from flowlab.recordings.pose_check import check_poses_fit
 from flowlab.recordings.registration_check import check_registration
 from flowlab.recordings.verdicts import Check
 from flowlab.recordings.world_check import check_world
@@ -36,4 +37,4 @@ def _geometry(source: "ParsedRecording") -> Iterator[Check]:
     yield from check_depth_unit(source)
     yield check_registration(source)
     yield from check_world(source)
-    yield check_motion(source)
+    yield check_motion(source) if seen.T_world_cam is None else check_poses_fit(source)

@@ -69,8 +69,12 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
     clock = _PictureClock(units[0], units[1], float(color.time_s[0]), known.fps or 1.0)
     checks += _number_checks(clock, color, depth, (*state, *action), known)
     lag = known.state_offset_s or 0.0
+    poses, late = streams.poses, known.T_world_cam_offset_s or 0.0
+    if poses is not None:
+        poses = _sample_timed(_in_order(poses, poses.name, recorded), streams, color, clock, known, late)
     timed = replace(
         streams,
+        poses=poses,
         color=_timed(color, clock.seconds(color.time_s, units[0])),
         depth=_timed(depth, clock.seconds(depth.time_s, units[1]) + (known.depth_offset_s or 0.0)),
         state=tuple(_sample_timed(s, streams, color, clock, known, lag) for s in state),
@@ -88,6 +92,8 @@ def _named(streams: Streams, known: Metadata) -> Iterator[tuple[str, tuple[Image
     yield "depth", (streams.depth, known.depth_offset_s or 0.0)
     for s in (*streams.state, *streams.action):
         yield s.name, (s, known.state_offset_s or 0.0)
+    if streams.poses is not None:
+        yield streams.poses.name, (streams.poses, known.T_world_cam_offset_s or 0.0)
 
 
 def _check_said(streams: Streams, known: Metadata) -> None:
@@ -185,12 +191,13 @@ def _check_overlap(streams: Streams) -> None:
     color = streams.color.time_s
     every: list[tuple[str, np.ndarray, str]] = [("depth", streams.depth.time_s, "depth_offset_s")]
     every += [(s.name, s.time_s, "state_offset_s") for s in (*streams.state, *streams.action)]
+    every += [] if streams.poses is None else [(streams.poses.name, streams.poses.time_s, "T_world_cam_offset_s")]
     for name, time_s, key in every:
         if len(time_s) and max(time_s[0] - color[-1], color[0] - time_s[-1]) > _APART_S:
             raise UnclearStamps(
                 f"color lies between {color[0]:.15g} and {color[-1]:.15g} s, and {name} between {time_s[0]:.15g} and "
                 f"{time_s[-1]:.15g} s: their clocks differ; write '{key}: ...', the seconds to add to the times of "
-                f"{'depth' if name == 'depth' else 'state'}"
+                f"{'state' if key == 'state_offset_s' else name}"
             )
 
 
@@ -203,7 +210,7 @@ def _clock_words(streams: Streams, units: Sequence[str], known: Metadata) -> tup
             how = "as 'time_unit' says" if known.time_unit else "by how they step and where they begin"
             verdict = verdict if unit == "s" or known.time_unit else Verdict.ASSUMED
         found.append(f"{name}: {stream.timing.source} are {_called(unit)}, {how}")
-    offsets = {key: getattr(known, key) for key in ("depth_offset_s", "state_offset_s")}
+    offsets = {key: getattr(known, key) for key in ("depth_offset_s", "state_offset_s", "T_world_cam_offset_s")}
     found += (f"'{key}: {value:g}' is added" for key, value in offsets.items() if value)
     return verdict, "; ".join(found)
 

@@ -87,6 +87,7 @@ def describe_parsed(source: ParsedRecording, settings: RecordingSettings) -> Rec
     start = streams.color.time_s[0]
     named = [("color", streams.color.time_s), ("depth", streams.depth.time_s)]
     named += [(s.name, s.time_s) for s in (*streams.state, *streams.action)]
+    named += [] if streams.poses is None else [("poses", streams.poses.time_s)]
     return RecordingDescription(
         path=source.path,
         reader=source.reader.name,

@@ -11,6 +11,7 @@ from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
+from flowlab.recordings.poses import check_known, poses_at
 from flowlab.recordings.sync import nearest_sample, sampling_rate
 from flowlab.recordings.verdicts import Check
 
@@ -52,6 +53,8 @@ class FrameCheck:
     """Index of the color picture of every bad frame."""
     repeated: Mapping[str, Int64[np.ndarray, "R"]] = field(default_factory=dict)
     """Indices of the pictures of ``color`` and ``depth`` that are the same as the one looked at before."""
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    """The pose of a camera that moves, at every row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +79,15 @@ def check_frames(
     stop_s: float | None,
     max_sync_s: float,
     max_state_s: float,
+    pose_gap_s: float = 0.0,
     stated: Sequence[str] = (),
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
-    an interval; and where its time does not lie after the frame before. ``stated`` are the streams of which the user
+    an interval; where no poses of a camera that moves are around it that are at most ``pose_gap_s`` apart; and where
+    its time does not lie after the frame before. ``stated`` are the streams of which the user
     says how they belong to color.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
@@ -92,6 +97,7 @@ def check_frames(
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
+    poses = None if streams.poses is None else poses_at(streams.poses, clock, pose_gap_s)
     kept = sorted(chosen(len(frames)))
     keep_color, keep_depth = set(frames[kept].tolist()), set(match[kept].tolist())
     color = {int(i): _look(streams.color, int(i), _look_at_color, int(i) in keep_color) for i in frames}
@@ -110,6 +116,8 @@ def check_frames(
             fault = BadFrame(name, f"no depth within {_ms(max_sync_s)}: the nearest is {_ms(off[k])} away")
         if fault is None:
             fault = _fault(streams.depth.names[j], depth[j], depth_size) or _stale(name, off_state, k, max_state)
+        if fault is None and poses is not None and not poses[1][k]:
+            fault = BadFrame(name, f"no pose: none at its time, and none on both sides within {_ms(pose_gap_s)}")
         if fault is not None:
             bad.append(fault)
             skipped.append(i)
@@ -124,13 +132,17 @@ def check_frames(
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)
+    T_world_cam = None
+    if streams.poses is not None and poses is not None:
+        T_world_cam, _ = poses_at(streams.poses, streams.color.time_s[rows[:, 0]], pose_gap_s)
+        checks += (check_known(streams.poses, poses[1], pose_gap_s),)
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
     repeated = {name: repeated_pictures(kept) for name, kept in zip(("color", "depth"), digests, strict=True)}
     return FrameCheck(
         rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples,
-        np.array(skipped, np.int64), repeated,
+        np.array(skipped, np.int64), repeated, T_world_cam,
     )  # fmt: skip
 
 

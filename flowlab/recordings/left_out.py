@@ -53,7 +53,7 @@ def _used(source: "ParsedRecording") -> set[str] | None:
     known, path = source.metadata, source.path
     used = {FILE_NAME}
     used |= {f for f in (known.times, known.depth_times, known.state, known.state_times, known.action,
-                         known.action_times) if f}  # fmt: skip
+                         known.action_times, known.T_world_cam_file, known.T_world_cam_times) if f}  # fmt: skip
     if source.streams.used is not None:
         return used | set(source.streams.used)
     if source.reader.name not in ("plain", "tum"):
@@ -81,10 +81,11 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
                 f"{cut(file.name)} is not used; if it is the {what}, write '{what}: {cut(file.name)}' into {FILE_NAME}"
             )
             return Check(what, Verdict.DOUBTFUL, says)
-    if name.stem.lower().startswith(_OF_CAMERAS):
+    if name.stem.lower().startswith(_OF_CAMERAS) and source.streams.poses is None:
         says = (
-            f"{cut(file.name)} is not used, and the camera is taken as fixed; if it stands still, write its pose as "
-            f"'T_world_cam' into {FILE_NAME}"
+            f"{cut(file.name)} is not used; if it has poses of a camera that moves, each camera to world, write "
+            f"'T_world_cam_file: {cut(file.name)}' into {FILE_NAME}, if one of a camera that stands still, that as "
+            "'T_world_cam'"
         )
         return Check("camera", Verdict.DOUBTFUL, says)
     return None

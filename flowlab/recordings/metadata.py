@@ -52,6 +52,8 @@ class Topics(Settings):
     depth_info: str | None = None
     state: str | None = None
     action: str | None = None
+    T_world_cam: str | None = None
+    """Poses of a camera that moves."""
 
 
 class Metadata(FiniteSettings):
@@ -81,6 +83,14 @@ class Metadata(FiniteSettings):
     """Meters per count of the depth pictures."""
     T_world_cam: Rigid | None = None
     """Pose of the color camera: maps its coordinates to the world's [m]. Without it the world is the camera."""
+    T_world_cam_file: PathInside | None = None
+    """Of a camera that moves: ``.npy`` or text with its pose at every color picture, or at times of their own."""
+    T_world_cam_times: PathInside | None = None
+    """File with the time of every pose [s], on the clock of the pictures."""
+    T_world_cam_offset_s: float | None = None
+    """Added to the times of the poses [s]."""
+    T_world_cam_gap_s: float | None = Field(default=None, gt=0)
+    """Poses this far apart [s] still tell what is between them; without it, 1.5 times the period of the pictures."""
     depth_intrinsics: Intrinsics | None = None
     """The depth camera, where depth is not registered to color."""
     T_color_depth: Rigid | None = None

@@ -83,7 +83,15 @@ def check_motion(source: "ParsedRecording") -> Check:
     far = f"{max(steps):.1f} px{_meters(source, a, max(steps))}"
     return Check("camera", Verdict.DOUBTFUL, f"it moves, and is taken as fixed: between {len(moving)} of {len(told)} "
                  f"pairs of pictures {mean:.0%} of the textured picture moves, by {far} at most (from row {a.row}); "
-                 "tracks are then in the moving camera's frame")  # fmt: skip
+                 "tracks are then in the moving camera's frame, unless its pose in every frame is given: as "
+                 f"{_where(source)} in {source.write_to}")  # fmt: skip
+
+
+def _where(source: "ParsedRecording") -> str:
+    """What names poses, by the layout."""
+    if source.reader.name == "ros":
+        return "'topics: {T_world_cam: ...}', a topic of poses,"
+    return "'T_world_cam_file: ...', a file with T_world_cam of every color picture or with times of its own,"
 
 
 def _pairs(samples: Sequence[PictureSample]) -> list[tuple[PictureSample, PictureSample]]:

@@ -19,10 +19,11 @@ from flowlab.recordings.content import without_saturated
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
+from flowlab.recordings.poses import ABOUT, load_poses, most_apart_s
 from flowlab.recordings.sample_files import load_samples
 from flowlab.recordings.stamps import UnclearStamps
 from flowlab.recordings.sync import last_sample, nearest_sample
-from flowlab.recordings.verdicts import Check
+from flowlab.recordings.verdicts import Check, Verdict
 
 
 class RecordingSettings(Settings):
@@ -83,7 +84,7 @@ class ParsedRecording:
         """What errors tell the user to write into."""
         return _write_to(self.path)
 
-    def frame_processor(self, settings: RecordingSettings) -> FrameProcessor:
+    def frame_processor(self, settings: RecordingSettings = RecordingSettings()) -> FrameProcessor:
         """What makes frames of it. Raises :class:`DataError` where calibration is missing or cannot be."""
         seen = self.frame_check
         if not len(seen.color):
@@ -133,13 +134,14 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     """Read the streams, find out what is known of them, and look at every picture."""
     reader = choose_reader(path, settings.reader)
     given = list(_given(path, settings))
-    streams = read_streams(reader, path, combine(given)[0])
+    said = combine(given)[0]
+    streams = read_streams(reader, path, said)
     for stream in (streams.color, streams.depth):
         if not len(stream):
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
     metadata, origin = combine([*given, *streams.known])
     try:
-        streams = without_saturated(put_on_one_clock(_with_files(path, streams, metadata), metadata))
+        streams = without_saturated(put_on_one_clock(_with_files(path, streams, metadata, said), metadata))
     except UnclearStamps as error:
         raise DataError(f"{path}: clock: {error}; all this goes into {_write_to(path)}") from error
     seen = check_frames(
@@ -149,6 +151,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         stop_s=settings.stop_s,
         max_sync_s=settings.max_sync_s,
         max_state_s=settings.max_state_s,
+        pose_gap_s=most_apart_s(streams.color, metadata.T_world_cam_gap_s),
         stated=[name for name in ("depth", "state") if getattr(metadata, f"{name}_offset_s") is not None],
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
@@ -173,7 +176,7 @@ def _given(path: Path, settings: RecordingSettings) -> Iterator[tuple[str, Metad
             yield file.name, load_metadata(file)
 
 
-def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
+def _with_files(path: Path, streams: Streams, metadata: Metadata, said: Metadata) -> Streams:
     """The streams, with state and actions from files where ``recording.yaml`` names some."""
     folder = path if path.is_dir() else path.parent
     changed: dict[str, Any] = {}
@@ -184,4 +187,26 @@ def _with_files(path: Path, streams: Streams, metadata: Metadata) -> Streams:
             columns = getattr(metadata, f"{name}_columns")
             samples = load_samples(folder / file, name, where, streams.color, FILE_NAME, columns, metadata.fps)
             changed[name] = (samples,)
-    return replace(streams, **changed)
+    if metadata.T_world_cam_file is not None:
+        times = metadata.T_world_cam_times
+        where = None if times is None else folder / times
+        changed["poses"] = load_poses(folder / metadata.T_world_cam_file, where, streams.color)
+    return _with_one_pose(path, replace(streams, **changed), said)
+
+
+def _with_one_pose(path: Path, streams: Streams, said: Metadata) -> Streams:
+    """The same streams, whose poses are not contradicted. Raises :class:`DataError` where they are."""
+    if said.T_world_cam_file is not None and said.T_world_cam is not None:
+        raise DataError(f"{path}: T_world_cam says that the camera stands still, and T_world_cam_file that it moves; "
+                        f"leave one of them out of {_write_to(path)}")  # fmt: skip
+    if streams.poses is None:
+        of_poses = [f"T_world_cam_{x}" for x in ("times", "offset_s", "gap_s") if getattr(said, f"T_world_cam_{x}")]
+        if of_poses:
+            raise DataError(f"{path}: '{of_poses[0]}' is said, but there are no poses that it could be said of; name "
+                            f"them with 'T_world_cam_file' in {_write_to(path)}")  # fmt: skip
+        return streams
+    if said.T_world_cam is None:
+        return streams
+    says = (f"{streams.poses.name} has {len(streams.poses.values)} poses of it, which are not used, since "
+            "T_world_cam says where it stands still; leave that out to use them")  # fmt: skip
+    return replace(streams, poses=None, checks=(*streams.checks, Check(ABOUT, Verdict.DOUBTFUL, says)))

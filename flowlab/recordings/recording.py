@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flowlab.demonstrations import Demonstration
 from flowlab.errors import DataError, UsageError
 from flowlab.recordings.base import (
     BadImage,
@@ -26,7 +27,7 @@ from flowlab.recordings.frame_processing import FrameProcessor
 from flowlab.recordings.parsing import AlignedSamples, ParsedRecording, RecordingSettings, parse_recording
 from flowlab.recordings.sync import find_gaps
 from flowlab.recordings.verdicts import CHECKS, raise_refused
-from flowlab.records import Demonstration, Frame
+from flowlab.records import Frame
 
 _LOG = logging.getLogger(__name__)
 __all__ = [
@@ -59,7 +60,7 @@ class Recording(Demonstration):
             counts = self.streams.depth.read(int(self.frame_check.depth[t]))
         except BadImage as error:
             raise DataError(f"{self.path}: row {t} could be read when it was opened, and now it {error}") from error
-        return Frame(self.processor.depth(counts), self.camera, rgb=self.processor.color(rgb))
+        return Frame(self.processor.depth(counts), self.camera_at(t), rgb=self.processor.color(rgb))
 
 
 def find_recordings(paths: Sequence[Path], reader: str | None = None) -> list[Path]:
@@ -116,18 +117,19 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     processor = source.frame_processor(settings)
     source.check_bad_frames(settings)
     raise_refused(path, source.checks)
-    rows = source.rows()
+    rows, poses = source.rows(), source.frame_check.T_world_cam
     success = np.zeros(len(rows.clock_s), bool)
     success[-1] = source.metadata.success
     recording = Recording(
         task=task,
         seed=seed,
-        camera=processor.camera,
+        camera=processor.camera if poses is None else processor.camera.at(poses[0]),
         time_s=rows.clock_s - rows.clock_s[0],
         state=rows.state,
         action=rows.action,
         success=success,
         extras=_extras(source, processor, rows),
+        T_world_cam=poses,
         path=source.path,
         streams=source.streams,
         processor=processor,
@@ -139,6 +141,13 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
             f"of the depth camera to the color camera, in meters; correct it in {source.write_to}"
         )
     return recording
+
+
+def _world(source: ParsedRecording) -> str:
+    """What the world frame is, in words."""
+    if source.streams.poses is not None:
+        return f"as the poses of the camera say, from {source.streams.poses.name}"
+    return "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame"
 
 
 def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSamples) -> dict[str, Any]:
@@ -154,7 +163,7 @@ def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSam
         "depth_unit_m": processor.depth_unit_m,
         "shrunk_by": processor.factor,
         "origin": dict(sorted(source.origin.items())),
-        "world": "as T_world_cam says" if "T_world_cam" in source.origin else "the camera's own frame",
+        "world": _world(source),
         "action": rows.action_source,
         "state_names": channel_names(streams.state),
         "action_names": channel_names(streams.action),

@@ -46,18 +46,20 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
     T_color_depth = source.metadata.T_color_depth
     if T_color_depth is not None:
         yield from _baseline(float(np.linalg.norm(np.array(T_color_depth)[:3, 3])), source.write_to)
-    if source.metadata.T_world_cam is None:
+    poses, seen = source.streams.poses, source.frame_check.T_world_cam
+    if source.metadata.T_world_cam is None and seen is None:
         says = "T_world_cam is not given, so the world is the camera's own frame: x right, y down, z forward"
         yield Check("world", Verdict.ASSUMED, says)
         return
-    T = np.array(source.metadata.T_world_cam, float)
+    T = np.array(source.metadata.T_world_cam, float) if seen is None else seen[0]
     if np.allclose(T[:3, :3], np.eye(3), atol=1e-6):
-        says = "T_world_cam turns nothing, so the world has the camera's axes: x right, y down, z forward"
+        what = "T_world_cam" if seen is None else "the first pose"
+        says = f"{what} turns nothing, so the world has the camera's axes: x right, y down, z forward"
         yield Check("world", Verdict.ASSUMED, says)
         return
-    stands = f"{_stands(T)}, from {source.origin.get('T_world_cam', '')}"
+    stands = f"{_stands(T)}, from {source.origin.get('T_world_cam', '') if poses is None else poses.name}"
     far = float(np.linalg.norm(T[:3, 3]))
-    if far > _FAR_M[0]:
+    if far > _FAR_M[0] and poses is None:
         verdict = Verdict.REFUSED if far > _FAR_M[1] else Verdict.DOUBTFUL
         unit = ", as if in millimeters" if far > _FAR_M[1] else ""
         says = (
@@ -66,7 +68,11 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
         yield Check("world", verdict, says)
         return
     plane = _dominant_plane(_cloud(source))
-    yield _judged(T, plane, stands, source.write_to)
+    judged = _judged(T, plane, stands, source.write_to)
+    if poses is not None and judged.verdict is not Verdict.OK:  # the world of tracked cameras has any axes
+        yield Check("world", Verdict.ASSUMED, f"at first {stands}; no level plane tells which way is up")
+        return
+    yield judged
 
 
 def _baseline(far: float, write_to: str) -> Iterator[Check]:

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, UInt8
 
 from flowlab.errors import DataError, UsageError
 from flowlab.files import new_folder
-from flowlab.geometry.camera import Camera
+from flowlab.geometry.camera import Camera, pose_fault
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.metadata import FILE_NAME
 
+_POSES = "T_world_cam.npy"
 _MAX_COUNT = np.iinfo(np.uint16).max
 
 
@@ -30,6 +31,7 @@ def write_rgbd_recording(
     success: bool = True,
     task: str | None = None,
     depth_unit_m: float = 0.001,
+    T_world_cam: Float[np.ndarray, "T 4 4"] | None = None,
     query_px: Float32[np.ndarray, "N 2"] | None = None,
     tracks_cam: Float32[np.ndarray, "T N 3"] | None = None,
     visible: Bool[np.ndarray, "T N"] | None = None,
@@ -49,6 +51,7 @@ def write_rgbd_recording(
         success: Whether the demonstration solved its task.
         task: What the robot does.
         depth_unit_m: What depth is rounded to: 0.0001 holds 6.5 m at a tenth of a millimeter.
+        T_world_cam: The pose of a camera that moves, at each picture; it wins over that of ``camera``.
         query_px: Pixels (x, y) of the first frame whose true tracks are known, for ``ground_truth.npz``.
         tracks_cam: Where their points are, in the camera frame of each instant [m].
         visible: Whether the camera sees them.
@@ -69,6 +72,7 @@ def write_rgbd_recording(
     truth = {"query_px": query_px, "tracks_cam": tracks_cam, "visible": visible, "role": role}
     given = {"state": state, "action": action}
     samples = {name: _rows(name, values, len(time_s)) for name, values in given.items() if values is not None}
+    poses = None if T_world_cam is None else _poses(T_world_cam, len(time_s))
     known: dict[str, Any] = {name: values for name, values in truth.items() if values is not None}
     try:
         with new_folder(folder) as temporary:
@@ -76,7 +80,10 @@ def write_rgbd_recording(
             (temporary / "times.txt").write_text("".join(f"{t!r}\n" for t in time_s.tolist()))
             for name, values in samples.items():
                 np.save(temporary / f"{name}.npy", values)
-            (temporary / FILE_NAME).write_text(_yaml(camera, list(samples), float(depth_unit_m), success, task))
+            if poses is not None:
+                np.save(temporary / _POSES, poses)
+            about = _yaml(camera, list(samples), float(depth_unit_m), success, task, moves=poses is not None)
+            (temporary / FILE_NAME).write_text(about)
             if query_px is not None:
                 np.savez_compressed(temporary / "ground_truth.npz", **known)
     except OSError as error:
@@ -179,14 +186,27 @@ def _counts(folder: Path, t: int, meters: np.ndarray, unit_m: float) -> np.ndarr
     return counts.astype(np.uint16)
 
 
-def _yaml(camera: Camera, files: list[str], depth_unit_m: float, success: bool, task: str | None) -> str:
+def _poses(T_world_cam: Any, steps: int) -> Float64[np.ndarray, "T 4 4"]:
+    """The pose of the camera at every picture."""
+    found = _numbers("T_world_cam", T_world_cam)
+    if found.shape != (steps, 4, 4):
+        raise UsageError(f"T_world_cam has the shape {found.shape}, expected ({steps}, 4, 4), a pose for each frame")
+    for t, T in enumerate(found):
+        if fault := pose_fault(T):
+            raise UsageError(f"T_world_cam[{t}] {fault}")
+    return found
+
+
+def _yaml(
+    camera: Camera, files: list[str], depth_unit_m: float, success: bool, task: str | None, *, moves: bool
+) -> str:
     """The content of ``recording.yaml``."""
     intrinsics = Intrinsics.from_matrix(camera.K, width=camera.width, height=camera.height)
     lines = [
         "times: times.txt",
         f"depth_unit_m: {depth_unit_m!r}",
         f"intrinsics: {intrinsics.to_yaml()}",
-        f"T_world_cam: {np.asarray(camera.T_world_cam, float).tolist()}",
+        f"T_world_cam_file: {_POSES}" if moves else f"T_world_cam: {np.asarray(camera.T_world_cam, float).tolist()}",
         *(f"{name}: {name}.npy" for name in files),
         f"success: {str(bool(success)).lower()}",
         *([yaml.safe_dump({"task": task}).strip()] if task is not None else []),

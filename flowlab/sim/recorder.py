@@ -9,10 +9,11 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 
 from flowlab.config import Settings
+from flowlab.demonstrations import Demonstration
 from flowlab.errors import DataError, UsageError
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import pose_9d, rigid
-from flowlab.records import Demonstration, Frame
+from flowlab.records import Frame
 from flowlab.sim.dp3_camera import dp3_camera
 from flowlab.sim.expert import Expert
 from flowlab.sim.render.zbuffer import PackedScene, ZBuffer

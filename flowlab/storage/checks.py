@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowlab.geometry.camera import pose_fault
 from flowlab.provenance import Provenance
 from flowlab.records import Episode, PositionSource
 from flowlab.storage.schema import SCHEMA
@@ -125,6 +126,18 @@ def _times(e: Episode) -> Iterator[ArrayProblem]:
         yield ArrayProblem("data/time", f"does not rise after step {int((np.diff(e.time_s) <= 0).argmax())}")
 
 
+def _poses(e: Episode) -> Iterator[ArrayProblem]:
+    """Poses of a camera that moves are poses, the first that of the episode's camera."""
+    if e.T_world_cam is None:
+        return
+    for t, T in enumerate(e.T_world_cam):
+        if fault := pose_fault(T):
+            yield ArrayProblem("data/T_world_cam", f"{fault}, at step {t}")
+            return
+    if not np.allclose(e.T_world_cam[0], e.camera.T_world_cam, rtol=0, atol=1e-6):
+        yield ArrayProblem("data/T_world_cam", "begins elsewhere than where the shard says that the camera is")
+
+
 def _counts(e: Episode) -> Iterator[ArrayProblem]:
     n = e.point_cloud.shape[1]
     if not ((e.point_count >= 1) & (e.point_count <= n)).all():
@@ -176,5 +189,5 @@ def _off_surface(e: Episode) -> Iterator[ArrayProblem]:
 
 
 _CHECKS: tuple[Callable[[Episode], Iterator[ArrayProblem]], ...] = (
-    _times, _teleports, _quality, _counts, _anchors, _off_surface,
+    _times, _poses, _teleports, _quality, _counts, _anchors, _off_surface,
 )  # fmt: skip

@@ -86,6 +86,11 @@ SCHEMA = (
         "data/depth", "float32", ("time", "v", "u"), "m", "z-depth picture; 0 where there is no reading",
         lambda e: e.depth, optional=True,
     ),
+    ArraySpec(
+        "data/T_world_cam", "float64", ("time", "row", "column"), "1 and m",
+        "pose of a camera that moves: maps its coordinates (OpenCV's axes) to the world's; the shard's camera is then "
+        "that of the first row", lambda e: e.T_world_cam, optional=True,
+    ),
     ArraySpec("data/rgb", "uint8", ("time", "v", "u", "rgb"), "1", "color picture", lambda e: e.rgb, optional=True),
     _quality("sigma", "float32", "m", "stated error of the position: 68 % of errors are meant to be below it"),
     _quality(
@@ -135,5 +140,6 @@ SCHEMA = (
 )  # fmt: skip
 QUALITY = tuple(f"data/{name.name}" for name in fields(Quality))
 """The arrays of :class:`~flowlab.records.Quality`: all of them or none."""
+POSES = "data/T_world_cam"
 EPISODE_ENDS = "meta/episode_ends"
 """int64 (episode,): the row after each episode's last; written beside the arrays of the schema."""

@@ -18,7 +18,7 @@ from flowlab.errors import DataError, RecordError, first_line
 from flowlab.files import new_file
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
-from flowlab.storage.schema import EPISODE_ENDS, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
+from flowlab.storage.schema import EPISODE_ENDS, POSES, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
 from flowlab.storage.shard_files import open_files, write_zip
 from flowlab.storage.stored_array import StoredArray, stored_array
 from flowlab.text import shown
@@ -89,6 +89,11 @@ class Shard:
 
     def __len__(self) -> int:
         return len(self.attributes.episodes)
+
+    @property
+    def camera(self) -> Camera | None:
+        """The camera of all episodes; None where it moves."""
+        return None if f"{POSES}/zarr.json" in self._files else Camera.from_json(self.attributes.camera)
 
     def about(self, k: int) -> Mapping[str, Any]:
         """The ``extras`` of the k-th episode."""
@@ -169,6 +174,7 @@ class Shard:
             depth=columns.get("data/depth"),
             rgb=columns.get("data/rgb"),
             extras=about.extras,
+            T_world_cam=columns.get(POSES),
         )
 
 

@@ -178,7 +178,7 @@ def _shape_problems(known: Provenance, columns: dict[str, np.ndarray], ends: np.
     if len(ends) == 0 or (np.diff(ends, prepend=0) <= 0).any():
         yield ArrayProblem(EPISODE_ENDS, f"must rise from above 0, found {ends.tolist()[:8]}")
         return
-    sizes = {"time": int(ends[-1]), "episode": len(ends), "xyz": 3, "rgb": 3, "pose": 9}
+    sizes = {"time": int(ends[-1]), "episode": len(ends), "xyz": 3, "rgb": 3, "pose": 9, "row": 4, "column": 4}
     sizes |= {dim: made["points"] for dim, made in (("point", known.observer), ("query", known.queries)) if made}
     for spec in SCHEMA:
         if spec.path not in columns:

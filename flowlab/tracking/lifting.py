@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from pydantic import Field
 
 from flowlab.config import Settings
-from flowlab.geometry.transforms import apply
+from flowlab.geometry.transforms import apply, inverse
 from flowlab.records import Clip, PositionSource, Tracks2D
 
 MEASURED, MODEL, FILLED = int(PositionSource.MEASURED), int(PositionSource.MODEL), int(PositionSource.FILLED)
@@ -74,11 +74,14 @@ def lift(clip: Clip, tracks: Tracks2D, settings: LiftSettings) -> Lifted:
         Positions in the world frame [m], and how each came about.
     """
     model = np.zeros((*tracks.visible.shape, 3), np.float32) if tracks.xyz_cam is None else tracks.xyz_cam
+    in_camera = clip.camera.at(np.eye(4))
     z, source, depth_valid, hidden = _read(
         clip.depth,
         tracks.xy,
         tracks.visible,
         model[..., 2],
+        _depth_if_still(clip),
+        in_camera.unproject(tracks.xy, np.ones(tracks.visible.shape)),
         window_px=settings.window_px,
         spread_px=settings.spread_px,
         nearness_m_per_px=settings.nearness_m_per_px,
@@ -95,11 +98,21 @@ def lift(clip: Clip, tracks: Tracks2D, settings: LiftSettings) -> Lifted:
         z[0, never], known[0, never] = np.median(readings) if len(readings) else 1.0, True
     visible = tracks.visible & ~hidden
     z = _between(z[..., None], known)[..., 0]
-    xyz_world = clip.camera.unproject(tracks.xy, z)
-    from_model = source == MODEL
-    xyz_world[from_model] = apply(clip.camera.T_world_cam, model[from_model].astype(np.float64))
+    xyz_world = clip.to_world(in_camera.unproject(tracks.xy, z))
+    rows, points = np.nonzero(source == MODEL)
+    T_world_cam = clip.camera.T_world_cam if clip.T_world_cam is None else clip.T_world_cam[rows]
+    xyz_world[rows, points] = apply(T_world_cam, model[rows, points].astype(np.float64))
     xyz_world = _between(xyz_world, known | visible)
     return Lifted(xyz_world.astype(np.float32), visible, source, depth_valid)
+
+
+def _depth_if_still(clip: Clip) -> Float64[np.ndarray, "T 4"]:
+    """Row t gives the depth in frame t of what stands still in the world, from where it was in frame t - 1."""
+    poses = clip.poses()
+    forward = np.tile(np.array([0.0, 0, 1, 0]), (len(clip), 1))
+    if clip.T_world_cam is not None:
+        forward[1:] = (inverse(poses[1:]) @ poses[:-1])[:, 2]
+    return forward
 
 
 def _between(values: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -118,6 +131,8 @@ def _read(  # type: ignore[no-untyped-def]
     xy,
     visible,
     model_z,
+    forward,
+    rays,
     window_px,
     spread_px,
     nearness_m_per_px,
@@ -137,6 +152,9 @@ def _read(  # type: ignore[no-untyped-def]
         last, extra = 0.0, 0.0  # depth where last known, and how much farther it may have moved since
         for t in range(steps):
             u, v = xy[t, m]
+            if t > 0 and last > 0:  # what comes nearer only because the camera does has not moved
+                x, y, _ = rays[t - 1, m]
+                last = (forward[t, 0] * x + forward[t, 1] * y + forward[t, 2]) * last + forward[t, 3]
             own = _own_reading(depth[t], u, v)
             count = _readings(depth[t], u, v, window_px, around, distance)
             if t == 0 and own > 0:

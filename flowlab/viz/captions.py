@@ -52,6 +52,14 @@ def _about_tracker(episode: Episode) -> Mapping[str, Any]:
     return about if isinstance(about, Mapping) else {}
 
 
+def _path(episode: Episode) -> str:
+    """How far a camera that moves goes, in words."""
+    if episode.T_world_cam is None:
+        return ""
+    steps = np.linalg.norm(np.diff(episode.T_world_cam[:, :3, 3], axis=0), axis=1)
+    return f" at first; it moves by {steps.sum():.2f} m in all"
+
+
 def describe(episode: Episode) -> str:
     """The facts of an episode as a Markdown table."""
     roles, counts = np.unique(episode.query_role[: episode.queries.count], return_counts=True)
@@ -65,7 +73,7 @@ def describe(episode: Episode) -> str:
         "query points": ", ".join(f"{n} {role_name(r)}" for r, n in zip(roles, counts, strict=True)),
         "visible": f"{episode.tracks.visible[:, : episode.queries.count].mean():.0%} of all track points",
         "camera": f"{camera.width} x {camera.height} px, f = {camera.K[0, 0]:.1f} px",
-        "camera position": f"{np.round(camera.T_world_cam[:3, 3], 3).tolist()} m",
+        "camera position": f"{np.round(camera.T_world_cam[:3, 3], 3).tolist()} m{_path(episode)}",
     }
     if "source" in episode.extras:
         rows["recording"] = episode.extras["source"]

@@ -66,7 +66,7 @@ def cloud_rgb_at(episode: Episode, t: int) -> UInt8[np.ndarray, "P 3"]:
     points = episode.point_cloud[t, : episode.point_count[t]]
     if episode.rgb is None or (episode.query_role != UNKNOWN).any():
         return cloud_rgb(cloud_role(episode, t))
-    uv, z = episode.camera.project(points)
+    uv, z = episode.camera_at(t).project(points)
     u, v = np.round(np.where(z[:, None] > 0, uv, -1)).clip(-1, np.shape(episode.rgb)[2:0:-1]).astype(int).T
     inside = (u >= 0) & (v >= 0) & (u < episode.rgb.shape[2]) & (v < episode.rgb.shape[1])
     rgb = np.tile(_CLOUD_GRAY.astype(np.uint8), (len(points), 1))

@@ -24,10 +24,12 @@ def is_upside_down(camera: Camera) -> bool:
     return bool(camera.T_world_cam[2, 1] > 0)
 
 
-def project_upright(camera: Camera, xyz_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-    """Pixels (u, v) of world points in the picture, turned by 180 degrees if the camera is_upside_down upside down;
-    not a number behind the camera."""
+def project_upright(
+    camera: Camera, xyz_world: Float[np.ndarray, "*batch 3"], turned: bool | None = None
+) -> Float[np.ndarray, "*batch 2"]:
+    """Pixels (u, v) of world points in the picture, turned by 180 degrees if the camera is upside down, or as
+    ``turned`` says; not a number behind the camera."""
     uv, z = camera.project(xyz_world)
-    if is_upside_down(camera):
+    if is_upside_down(camera) if turned is None else turned:
         uv = np.array([camera.width - 1, camera.height - 1]) - uv
     return np.where(z[..., None] > 0, uv, np.nan)

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float32, Int, UInt8
 
 from flowlab.records import Episode, FlowPrediction, PositionSource
 from flowlab.viz.colors import PREDICTED_RGB, track_rgb
-from flowlab.viz.orientation import project_upright
+from flowlab.viz.orientation import is_upside_down, project_upright
 from flowlab.viz.plan_predictions import PlanPrediction, plan_predictions
 
 _RIM = (16, 18, 22)
@@ -31,7 +31,7 @@ class Overlay:
     def __init__(self, episode: Episode, scale: int, trail: int, prediction: FlowPrediction | None = None) -> None:
         M, quality = episode.queries.count, episode.tracks.quality
         self._episode, self._scale = episode, scale
-        self._uv, self._there = self._on_canvas(episode.tracks.xyz_world[:, :M])
+        self._uv, self._there = self._paths_on_canvas(episode.tracks.xyz_world[:, :M])
         self._visible = episode.tracks.visible[:, :M]
         self._filled = (
             np.zeros_like(self._visible) if quality is None else quality.source[:, :M] == PositionSource.FILLED
@@ -46,7 +46,7 @@ class Overlay:
         self._draw_trails(canvas, t)
         in_force = [plan for plan in self._plans if plan.step <= t]
         if in_force:
-            self._draw_prediction(canvas, in_force[-1])
+            self._draw_prediction(canvas, in_force[-1], t)
         there, visible, filled = self._there[t], self._visible[t], self._filled[t]
         for k in np.flatnonzero(there & filled):
             self._draw_cross(canvas, t, int(k))
@@ -55,21 +55,31 @@ class Overlay:
         for k in np.flatnonzero(there & ~filled & visible):
             self._draw_disc(canvas, t, int(k))
 
+    def _paths_on_canvas(
+        self, xyz_world: Float32[np.ndarray, "T M 3"]
+    ) -> tuple[Int[np.ndarray, "T M 2"], Bool[np.ndarray, "T M"]]:
+        """Where points are on the canvas of every step, which are others where the camera moves."""
+        if self._episode.T_world_cam is None:
+            return self._on_canvas(xyz_world, 0)
+        uv, there = zip(*(self._on_canvas(row, t) for t, row in enumerate(xyz_world)), strict=True)
+        return np.stack(uv), np.stack(there)
+
     def _on_canvas(
-        self, xyz_world: Float32[np.ndarray, "*batch 3"]
+        self, xyz_world: Float32[np.ndarray, "*batch 3"], t: int
     ) -> tuple[Int[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
-        """Where points are on the canvas, in OpenCV's fixed point, and whether they are anywhere near it."""
-        camera, scale = self._episode.camera, self._scale
-        canvas_uv = (project_upright(camera, xyz_world) + 0.5) * scale - 0.5  # the center of a pixel, enlarged
+        """Where points are on the canvas of a step, in OpenCV's fixed point, and whether they are anywhere near it."""
+        camera, scale = self._episode.camera_at(t), self._scale
+        uv = project_upright(camera, xyz_world, is_upside_down(self._episode.camera))
+        canvas_uv = (uv + 0.5) * scale - 0.5  # the center of a pixel, enlarged
         far = 8 * max(camera.width, camera.height) * scale  # OpenCV counts in 32 bits
         there = np.all(np.abs(canvas_uv) < far, axis=-1)
         return np.round(np.where(there[..., None], canvas_uv, 0) * 2**_SUBPIXEL).astype(np.int32), there
 
-    def _draw_prediction(self, canvas: UInt8[np.ndarray, "H W 3"], plan: PlanPrediction) -> None:
+    def _draw_prediction(self, canvas: UInt8[np.ndarray, "H W 3"], plan: PlanPrediction, t: int) -> None:
         """Thin bright lines, each with a dot at its end, as far as they can be seen from the camera."""
         import cv2
 
-        uv, there = self._on_canvas(plan.predicted_world[:, plan.predicted_moving])
+        uv, there = self._on_canvas(plan.predicted_world[:, plan.predicted_moving], t)
         paths, ends = [path[ok] for path, ok in zip(uv.swapaxes(0, 1), there.T, strict=True)], uv[-1][there[-1]]
         for width, radius, rgb, alpha in ((2.6, 3.2, _RIM, _PATH_RIM_ALPHA), (1.0, 2.4, PREDICTED_RGB, 1.0)):
             layer = canvas.copy()

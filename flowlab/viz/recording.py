@@ -136,11 +136,17 @@ def _send_predictions(recording: rr.RecordingStream, episode: Episode, plans: Se
 
 
 def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
-    """The camera, and which way is up."""
+    """The camera at every step, and which way is up."""
     camera, T_world_cam = episode.camera, episode.camera.T_world_cam
     axes = rr.ViewCoordinates.RDF if world_is_camera_frame(camera) else rr.ViewCoordinates.RIGHT_HAND_Z_UP
     recording.log("/", axes, static=True)
-    recording.log(CAMERA, rr.Transform3D(translation=T_world_cam[:3, 3], mat3x3=T_world_cam[:3, :3]), static=True)
+    if episode.T_world_cam is None:
+        recording.log(CAMERA, rr.Transform3D(translation=T_world_cam[:3, 3], mat3x3=T_world_cam[:3, :3]), static=True)
+    else:
+        T = episode.T_world_cam
+        columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
+        recording.send_columns(CAMERA, _times(episode), columns)
+        recording.log("/world/camera_path", rr.LineStrips3D([T[:, :3, 3]], colors=SERIES_RGB[-1]), static=True)
     pinhole = rr.Pinhole(
         image_from_camera=camera.K,
         resolution=[camera.width, camera.height],

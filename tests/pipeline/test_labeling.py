@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from synthetic import assert_same, make_episode, with_quality
 from synthetic_clip import BOARD_M, CAMERA, WALL_M, film, record, truth
 
+from flowlab.demonstrations import QueriedDemo
 from flowlab.engines.base import UnitResult
 from flowlab.errors import DataError, UsageError
 from flowlab.pipeline.inspection import estimate_cost, inspect_recordings
@@ -19,7 +21,7 @@ from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.stages.recording import LiftStage, QualityStage, TrackStage
 from flowlab.pipeline.units import WorkUnit
-from flowlab.records import Episode, PositionSource, QueriedDemo
+from flowlab.records import Episode, PositionSource
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.receipts import Receipt
 from flowlab.storage.validation import validate
@@ -340,6 +342,28 @@ def test_recordings_of_another_width_are_rejected(recordings: Path, recipe: Reci
     assert made.stats["episodes"] == 1
     (reject,) = made.rejects
     assert reject.reason == (
-        "its action has 2 numbers a step, that of the dataset's other episodes 4; give it as many, or label it into "
-        "another --out"
+        "its action has 2 numbers a step, that of the dataset's other episodes 4; choose the same ones in the same "
+        "order, or label it into another --out"
     )
+
+
+def test_recordings_whose_numbers_are_called_otherwise_are_rejected(recipe: Recipe, tmp_path: Path) -> None:
+    """The same two joints in another order are as many, and something else."""
+    folder = tmp_path / "slide"
+    for name, columns in (("1", "a,b"), ("2", "b,a"), ("3", "a,b")):
+        record(folder / name)
+        lines = [f"{t}.5,{t + 1}" for t in range(20)]
+        (folder / name / "state.csv").write_text("\n".join([columns, *lines]))
+        about = yaml.safe_load((folder / name / "recording.yaml").read_text())
+        (folder / name / "recording.yaml").write_text(yaml.safe_dump({**about, "state": "state.csv"}))
+    made = label(recipe, find_jobs(recipe, [folder]), tmp_path / "data")
+    assert made.stats["episodes"] == 2
+    (reject,) = made.rejects
+    assert reject.source == str(folder / "2")
+    assert reject.reason.startswith("its state is 'b', 'a', that of the dataset's other episodes 'a', 'b'; choose")
+    with (folder / "2" / "recording.yaml").open("a") as about_the_second:
+        about_the_second.write("state_columns: [a, b]\n")
+    again = label(recipe, find_jobs(recipe, [folder]), tmp_path / "data")
+    assert (again.stats["episodes"], list(again.rejects)) == (3, [])
+    second = next(e for e in again if e.extras["source"].endswith("2"))
+    assert second.state[0].tolist() == [1.0, 0.5]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from synthetic import CAMERA, assert_same, make_episode, make_manifest
 
+from flowlab.demonstrations import Demonstration, ObservedDemo, QueriedDemo
 from flowlab.errors import DataError, UsageError
 from flowlab.perception.observer import Box
 from flowlab.perception.queries import EdgeSettings
@@ -22,7 +23,7 @@ from flowlab.pipeline.stages.simulation import ExpertStage, RigidFlowStage
 from flowlab.pipeline.stages.write import WriteStage
 from flowlab.pipeline.units import WorkUnit
 from flowlab.pipeline.worker import run_unit
-from flowlab.records import Demonstration, Episode, Frame, ObservedDemo, QueriedDemo
+from flowlab.records import Episode, Frame
 from flowlab.storage.dataset import Dataset, begin
 from flowlab.storage.shard import Shard
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from real_recordings import INTRINSICS, colors, counts, opened, write_png, write_yaml
+from real_recordings import INTRINSICS, colors, counts, opened, said, write_png, write_yaml
 
 from flowlab.errors import DataError
 from flowlab.recordings.readers.tum import KINECTS
@@ -75,7 +75,7 @@ def test_a_millimeter_sequence_in_this_layout(tmp_path: Path) -> None:
     write_yaml(path / "recording.yaml", intrinsics=INTRINSICS, depth_unit_m=0.001)
     recording = opened(path, every=4)
     assert recording.extras["depth_unit_m"] == 0.001
-    assert "it moves (groundtruth.txt), and is taken as fixed" in [c["says"] for c in recording.extras["checks"]]
+    assert said(recording, "poses").startswith("groundtruth.txt is not used")
 
 
 @pytest.mark.parametrize("line", ["1305031102.2", "now rgb/a.png", "1.0 rgb/a.png more", "nan rgb/a.png"])

@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from flowlab.demonstrations import ObservedDemo, QueriedDemo
 from flowlab.geometry.camera import Camera
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.stage import EpisodeRequest
-from flowlab.records import Episode, ObservedDemo, QueriedDemo, Role
+from flowlab.records import Episode, Role
 from flowlab.sim.exact_tracks import RigidFlowSettings, rigid_tracks, visibility
 from flowlab.sim.recorder import Rollout
 

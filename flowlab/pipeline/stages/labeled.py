@@ -3,7 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
-from flowlab.records import Episode, QueriedDemo, Tracks3D
+from flowlab.demonstrations import QueriedDemo
+from flowlab.records import Episode, Tracks3D
 
 
 def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
@@ -25,4 +26,5 @@ def labeled(record: QueriedDemo, tracks: Tracks3D, **extras: Any) -> Episode:
         depth=seen.depth,
         rgb=seen.rgb,
         extras={**demo.extras, **extras},
+        T_world_cam=demo.T_world_cam,
     )

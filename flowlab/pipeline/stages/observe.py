@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 
 from flowlab.config import Settings
+from flowlab.demonstrations import Demonstration, ObservedDemo, QueriedDemo
 from flowlab.errors import DataError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
 from flowlab.pipeline.stage import Rejected, Stage
 from flowlab.provenance import Provenance
-from flowlab.records import Demonstration, Frame, ObservedDemo, QueriedDemo
+from flowlab.records import Frame
 
 
 class ObserverStage(Stage, ObserverSettings):

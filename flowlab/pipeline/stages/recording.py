@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import Field, model_validator
 
+from flowlab.demonstrations import QueriedDemo, TrackedDemo
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
@@ -18,7 +19,7 @@ from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
 from flowlab.recordings.identity import difference, identity, wait_until_quiet
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
-from flowlab.records import Clip, Episode, QueriedDemo, Queries, TrackedDemo
+from flowlab.records import Clip, Episode, Queries
 from flowlab.storage.recorded import CONTENT
 from flowlab.tracking.base import make_tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
@@ -110,7 +111,7 @@ def clip_of(record: QueriedDemo) -> Clip:
     seen = record.observed
     if seen.rgb is None:
         raise Rejected("the recording has no color pictures, and points are followed in these; record color too")
-    return Clip(seen.rgb, seen.depth, seen.demo.camera)
+    return Clip(seen.rgb, seen.depth, seen.demo.camera, seen.demo.T_world_cam)
 
 
 class LiftStage(Stage, LiftSettings):

@@ -1,5 +1,6 @@
 """The stages of simulation, with those it shares. Each is a thin skin over the function that does the work."""
 
+from flowlab.demonstrations import QueriedDemo
 from flowlab.errors import DataError
 from flowlab.pipeline.memory import return_freed_memory
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
@@ -8,7 +9,7 @@ from flowlab.pipeline.stages.labeled import labeled
 from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage
 from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
-from flowlab.records import Episode, QueriedDemo
+from flowlab.records import Episode
 from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import ExpertSettings, Rollout, TaskSimulator
 from flowlab.sim.scene_settings import SceneSettings, describe_scene

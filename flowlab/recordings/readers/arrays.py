@@ -13,6 +13,7 @@ from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.metadata import FILE_NAME, Metadata
+from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.unused_files import robot_numbers, some_of
@@ -97,7 +98,11 @@ class ArraysReader:
         known: tuple[tuple[str, Metadata], ...] = (
             () if K is None else ((f"{path.name}:{names['intrinsics']}", _known(path, K)),)
         )
-        known += () if T is None else ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
+        poses = None
+        if T is not None and _moves(T):
+            poses = _poses(store, T, *stamps)
+        elif T is not None:
+            known += ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
             ImageStream(_called(names["color"], len(color)), stamps[0], partial(_color, store, color), stamps[1]),
             ImageStream(_called(names["depth"], len(depth)), stamps[0], partial(_depth, store, depth), stamps[1]),
@@ -106,6 +111,7 @@ class ArraysReader:
             known=known,
             checks=_unused_members(path, names),
             used=tuple(f"{name}.npy" for what, name in names.items() if what != "cloud"),
+            poses=poses,
         )
 
 
@@ -223,15 +229,29 @@ def _known(path: Path, K: np.ndarray) -> Metadata:
     return Metadata(intrinsics=Intrinsics.from_matrix(every[0]))
 
 
+def _moves(T: np.ndarray) -> bool:
+    """Whether poses are others from step to step."""
+    return T.ndim == 3 and T.dtype.kind in "iuf" and len(T) > 1 and not np.allclose(T, T[:1], rtol=0, atol=1e-6)
+
+
+def _poses(store: _Store, T: np.ndarray, time_s: np.ndarray, timing: Timing) -> SampleStream:
+    """The poses of a camera that moves."""
+    name = store.names["pose"]
+    if name not in POSES:
+        raise DataError(f"{store.path}: '{name}' does not say whether it maps camera to world or world to camera; call it "  # noqa: E501
+                        "'T_world_cam' if it maps camera to world, else invert it")  # fmt: skip
+    found = check_poses(f"{store.path}: '{name}'", T)
+    if len(found) != len(time_s):
+        raise DataError(f"{store.path}: '{name}' has {len(found)} poses for {len(time_s)} steps, expected one for each")
+    return pose_stream(f"'{name}'", time_s, found, timing)
+
+
 def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
     """The pose of the camera, where it is the same at every step."""
     advice = f"give the pose of a camera that stands still as 'T_world_cam' in {FILE_NAME}"
     if T.shape[-2:] != (4, 4) or not T.size or T.dtype.kind not in "iuf":
         raise DataError(f"{path}: '{name}' is {T.dtype} {cut(str(T.shape))}, expected numbers (4, 4); {advice}")
     every = T.reshape(-1, 4, 4).astype(float)
-    if not np.allclose(every, every[0], rtol=0, atol=1e-6):
-        raise DataError(f"{path}: '{name}' changes from step to step: the camera moves, and is read as fixed; {advice}, or "  # noqa: E501
-                        "record one that does")  # fmt: skip
     if name not in POSES:
         raise DataError(f"{path}: '{name}' does not say whether it maps camera to world or world to camera; {advice}")
     return Metadata(T_world_cam=every[0].tolist())

@@ -12,6 +12,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.metadata import FILE_NAME, Metadata, Topics
+from flowlab.recordings.poses import pose_stream
 from flowlab.recordings.readers.joint_states import JointGroup, join_by_name
 from flowlab.recordings.readers.realsense import is_sdk_bag
 from flowlab.recordings.readers.ros_bag import BagIndex, RosBag
@@ -24,6 +25,7 @@ from flowlab.recordings.readers.ros_messages import (
     message_numbers,
     relative_pose,
 )
+from flowlab.recordings.readers.ros_poses import read_pose_topic
 from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
@@ -70,6 +72,12 @@ class ROSReader:
             robot[what], told = ((), []) if topic is None else streams[topic].samples(what)
             checks += told
         checks += _unchosen(bag, topics)
+        poses = None
+        if topics.T_world_cam is not None:
+            of = streams[topics.T_world_cam]
+            T, check = read_pose_topic(bag, of.name, bag.first(topics.color).header.frame_id, _static(bag))
+            poses = pose_stream(of.name, of.index.measured_s, T, of.timing())
+            checks.append(check)
         return Streams(
             streams[topics.color].pictures(),
             streams[topics.depth].pictures(),
@@ -79,7 +87,14 @@ class ROSReader:
             registered=registered,
             checks=tuple(checks),
             used=bag.files(),
+            poses=poses,
         )
+
+
+def _static(bag: RosBag) -> list[Any]:
+    """The transforms that never change."""
+    return [t for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")
+            for _, message in bag.messages(topic) for t in message.transforms]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +107,11 @@ class ChosenTopics:
     action: str | None
     color_info: str | None
     depth_info: str | None
+    T_world_cam: str | None
 
     def all(self) -> list[str]:
         """Those with a message per instant."""
-        return [t for t in (self.color, self.depth, self.state, self.action) if t is not None]
+        return [t for t in (self.color, self.depth, self.state, self.action, self.T_world_cam) if t is not None]
 
 
 def choose_topics(bag: RosBag, given: Metadata) -> ChosenTopics:
@@ -118,6 +134,7 @@ def choose_topics(bag: RosBag, given: Metadata) -> ChosenTopics:
         asked.action,
         asked.color_info or _info_of(color, infos),
         asked.depth_info or _info_of(depth, infos),
+        asked.T_world_cam,
     )
 
 
@@ -183,10 +200,8 @@ def _calibration(
     found: list[tuple[str | None, dict[str, Any]]] = [(topics.color_info, {"intrinsics": known["color"]})]
     if registered is False:
         found.append((topics.depth_info, {"depth_intrinsics": known["depth"]}))
-        static = [t for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")
-                  for _, message in bag.messages(topic) for t in message.transforms]  # fmt: skip
         # Cameras that see differently and yet are said to be one and the same are not where that says.
-        T_color_depth = None if frames[0] == frames[1] else relative_pose(static, *frames)
+        T_color_depth = None if frames[0] == frames[1] else relative_pose(_static(bag), *frames)
         found.append(("/tf_static", {"T_color_depth": None if T_color_depth is None else T_color_depth.tolist()}))
     return registered, [(name, Metadata(**values)) for name, values in found if name is not None], [check]
 

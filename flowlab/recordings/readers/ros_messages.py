@@ -170,9 +170,28 @@ def relative_pose(transforms: Iterable[Any], to: str, frm: str) -> np.ndarray | 
     return reached.get(frm.lstrip("/"))
 
 
+def pose_of(message: Any) -> tuple[np.ndarray, str, str]:
+    """The pose (4, 4) that a message tells, the frame in which, and of which where it says so.
+
+    Raises:
+        ValueError: The message tells none.
+    """
+    world = message.header.frame_id if hasattr(message, "header") else ""
+    child = getattr(message, "child_frame_id", "")
+    if hasattr(message, "transform"):
+        return _matrix(message.transform), world, child
+    pose = getattr(message, "pose", message)
+    pose = getattr(pose, "pose", pose)  # with covariance
+    if not hasattr(pose, "orientation"):
+        raise ValueError("it holds no pose")
+    return _matrix(pose), world, child
+
+
 def _matrix(transform: Any) -> np.ndarray:
-    """A Transform as a matrix (4, 4)."""
-    q, t = transform.rotation, transform.translation
+    """A Transform or a Pose as a matrix (4, 4)."""
+    q, t = (transform.orientation, transform.position) if hasattr(transform, "orientation") else (
+        transform.rotation, transform.translation
+    )  # fmt: skip
     length = np.linalg.norm([q.x, q.y, q.z, q.w])
     if not 1e-6 < length < 1e6:
         raise ValueError(f"the rotation {[q.x, q.y, q.z, q.w]} of a transform is none")

@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 
 from flowlab.errors import DataError
-from flowlab.recordings.base import Streams
+from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.poses import pose_stream, read_poses
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import is_path_inside, shown
 from flowlab.untrusted import read_text
 
+GROUND_TRUTH = "groundtruth.txt"
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt")
 DEPTH_FACTOR = 5000
 """Counts per meter of the benchmark's depth pictures."""
@@ -61,14 +63,33 @@ class TUMReader:
         if camera is not None:
             known.append((f"TUM RGB-D's calibration of {camera}", Metadata(intrinsics=KINECTS[camera])))
         files = [[path / entry[1] for entry in entries] for entries in (color, depth)]
-        moving = Check("camera", Verdict.DOUBTFUL, "it moves (groundtruth.txt), and is taken as fixed")
+        poses, checks = _ground_truth(path / GROUND_TRUTH)
         return Streams(
             color_stream(files[0], *_stamps(lists[0], color)),
             depth_stream(files[1], *_stamps(lists[1], depth)),
             known=tuple(known),
             registered=True,
-            checks=(moving,) if (path / "groundtruth.txt").is_file() else (),
+            checks=checks,
+            poses=poses,
         )
+
+
+def _ground_truth(file: Path) -> tuple[SampleStream | None, tuple[Check, ...]]:
+    """The poses of the color camera, where the file is a list of them: ``timestamp tx ty tz qx qy qz qw``."""
+    if not file.is_file():
+        return None, ()
+    first = next((x.split() for x in read_text(file).splitlines() if x.strip() and not x.lstrip().startswith("#")), [])
+    try:
+        numbers = [float(x) for x in first]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 8:
+        says = (f"{file.name} is not used: its first line is not 'timestamp tx ty tz qx qy qz qw' "
+                f"({shown(' '.join(first))})")  # fmt: skip
+        return None, (Check("poses", Verdict.DOUBTFUL, says),)
+    own, T = read_poses(file)
+    assert own is not None
+    return pose_stream(file.name, own[0], T, own[1]), ()
 
 
 def _both(path: Path) -> bool:

@@ -58,12 +58,14 @@ def motion_costs(
     features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
     R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
     cost, moved = _costs.motion_costs(xyz_cam, features, frames, R, t, pictures.depth, pictures.feature, pictures.K)
+    if pictures.still is not None:  # what moves before the camera alone does not move
+        moved[[k for k, m in enumerate(motions) if m is pictures.still]] = 0
     return cost + motion_penalty * moved
 
 
 def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMotion]) -> BodyAssignment:
     """Costs of stillness and of some motions, in all cells whose motion is undecided."""
-    every = [RigidMotion.identity(len(pictures)), *motions]
+    every = [pictures.stillness, *motions]
     raw = np.full((len(every), *grid.valid.shape), _UNKNOWN_COST, np.float32)
     raw[0] = 0
     uv = grid.pixels(grid.undecided)

@@ -32,7 +32,7 @@ class RigidBodyFit:
     @property
     def motions(self) -> list[RigidMotion]:
         """Stillness, then the motion of every body."""
-        return [RigidMotion.identity(len(self.pictures)), *(b.motion for b in self.bodies)]
+        return [self.pictures.stillness, *(b.motion for b in self.bodies)]
 
 
 def new_body(pictures: ClipFeatures, grid: MotionGrid, region: Bool[np.ndarray, "h w"]) -> RigidBody:

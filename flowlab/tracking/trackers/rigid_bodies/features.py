@@ -7,8 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int8, Num, UInt8
 
+from flowlab.geometry.transforms import inverse
 from flowlab.records import Clip
 from flowlab.tracking.trackers.rigid_bodies import _surfaces
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 WIDTH = 320
 """Pictures are shrunk by a whole factor to about this width [px]: the fit gains nothing from more."""
@@ -36,9 +38,17 @@ class ClipFeatures:
     """Locally normalized lightness, and CIE lightness, a and b; see :mod:`._costs` for what a count costs."""
     flow: Float32[np.ndarray, "T h w 2"]
     """Where a pixel of the frame before goes in this one [px]; 0 for the first."""
+    still: RigidMotion | None = None
+    """How what stands still in the world moves before a camera that moves; None where that stands still, too, or where
+    nobody knows."""
 
     def __len__(self) -> int:
         return len(self.depth)
+
+    @property
+    def stillness(self) -> RigidMotion:
+        """The motion of what stands still."""
+        return RigidMotion.identity(len(self)) if self.still is None else self.still
 
     def lightness(self, t: int) -> Float32[np.ndarray, "h w"]:
         """The lightness of a frame, 0 to 255."""
@@ -93,7 +103,11 @@ def extract_features(clip: Clip, max_depth: float) -> ClipFeatures:
     dense: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     for k in range(1, len(depth)):
         flow[k] = dense.calc(feature[k - 1, :, :, 1].copy(), feature[k, :, :, 1].copy(), None)
-    return ClipFeatures(K, factor, offset, depth, smooth, normal, feature, flow)
+    still = None
+    if clip.T_world_cam is not None:
+        T_cam_first = inverse(clip.T_world_cam) @ clip.T_world_cam[0]
+        still = RigidMotion(T_cam_first[:, :3, :3].copy(), T_cam_first[:, :3, 3].copy())
+    return ClipFeatures(K, factor, offset, depth, smooth, normal, feature, flow, still)
 
 
 def _feature(rgb: np.ndarray, factor: int, offset: int) -> np.ndarray:

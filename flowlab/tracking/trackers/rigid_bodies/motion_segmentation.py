@@ -82,20 +82,37 @@ def segment_motion(pictures: ClipFeatures) -> MotionGrid:
 def _count_evidence(pictures: ClipFeatures, z: np.ndarray) -> tuple[np.ndarray, ...]:
     """In how many later frames the camera looks through each cell of depth z (h, w) [m], in how many the surface is
     there still, how much it looks unlike the first frame in those together, and in how many of the last it is."""
-    within = 0.010 * np.maximum(1, z * z)
     through, near, unlike, late = np.zeros((4, *z.shape))
     for t in range(1, len(pictures)):
-        low, high = (x[::STEP, ::STEP] for x in _extremes(pictures.depth[t]))
-        d = pictures.depth[t, ::STEP, ::STEP]
+        depth, lightness, z = _as_first_seen(pictures, t)
+        within = 0.010 * np.maximum(1, z * z)
+        low, high = (x[::STEP, ::STEP] for x in depth[1:])
+        d = depth[0][::STEP, ::STEP]
         seen_through = (high > 0) & (low > z + within)
         there = (high > 0) & ~seen_through
         there &= (np.abs(d - z) < within) | (np.abs(low - z) < within) | (np.abs(high - z) < within)
         through += seen_through
         near += there
         late += there & (t >= _LATE_SHARE * len(pictures))
-        change = cv2.blur(cv2.absdiff(pictures.feature[t, :, :, 0], pictures.feature[0, :, :, 0]), (5, 5))
+        change = cv2.blur(cv2.absdiff(lightness, pictures.feature[0, :, :, 0]), (5, 5))
         unlike += there * change[::STEP, ::STEP]
     return through, near, unlike, late
+
+
+def _as_first_seen(pictures: ClipFeatures, t: int) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Of a later frame, what it shows where each pixel of the first would be if it stood still: depth, with its least
+    and greatest around, and lightness; and the depth (h, w) [m] that each cell would then have."""
+    depth = (pictures.depth[t], *_extremes(pictures.depth[t]))
+    lightness = pictures.feature[t, :, :, 0]
+    if pictures.still is None:
+        return depth, lightness, pictures.depth[0, ::STEP, ::STEP]
+    v, u = np.mgrid[: lightness.shape[0], : lightness.shape[1]]
+    z = np.where(pictures.depth[0] > 0, pictures.depth[0], 1.0)
+    xyz = pictures.unproject(np.stack([u, v], -1), z) @ pictures.still.R[t].T + pictures.still.t[t]
+    at = pictures.project(xyz).astype(np.float32)
+    at[xyz[..., 2] <= 0] = -1e4
+    seen = tuple(cv2.remap(x, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderValue=0) for x in depth)
+    return seen, cv2.remap(lightness, at[..., 0], at[..., 1], cv2.INTER_LINEAR), xyz[::STEP, ::STEP, 2]
 
 
 def _edges(depth: np.ndarray) -> np.ndarray:

@@ -64,7 +64,9 @@ class RigidBodiesSession:
 
     def _from(self, first: int, stop: int, xy: np.ndarray) -> Tracks2D:
         """Follow points (M, 2) of frame ``first`` to the frame before ``stop``."""
-        clip = Clip(self._clip.rgb[first:stop], self._clip.depth[first:stop], self._clip.camera)
+        whole = self._clip
+        poses = None if whole.T_world_cam is None else whole.T_world_cam[first:stop]
+        clip = Clip(whole.rgb[first:stop], whole.depth[first:stop], whole.camera, poses)
         z = depth_at(clip.depth[0], xy)
         deep = np.flatnonzero((z > 0) & (z < self._options.max_depth))
         if len(clip) < _MIN_FRAMES or len(deep) == 0:
