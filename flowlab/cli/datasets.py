@@ -1,6 +1,7 @@
 """``flowlab info``, ``flowlab validate`` and ``flowlab export``."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ import click
 
 from flowlab.cli.console import echo, print_json, print_table, say
 from flowlab.cli.paths import PATH
-from flowlab.errors import DataError
+from flowlab.errors import DataError, FlowlabError
 
 if TYPE_CHECKING:
     from flowlab.storage.validation import Finding
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def info(dataset: Path, as_json: bool) -> None:
     """Say what a dataset holds and how it was made."""
-    from flowlab.cli.reports import print_quality
+    from flowlab.cli.reports import facts_of_checks, print_checks, print_quality
+    from flowlab.pipeline.kept_checks import total_checks
     from flowlab.storage.dataset import open_dataset
     from flowlab.storage.overview import dataset_overview
 
@@ -43,9 +45,11 @@ def info(dataset: Path, as_json: bool) -> None:
         "missing": data.missing,
         "world_frame": data.provenance.world_frame,
     }
+    checks = total_checks(data)
     if as_json:
         manifest = data.manifest.model_dump(mode="json")
         recordings = {"recordings": manifest["recordings"]} if manifest["recordings"] else {}
+        recordings |= {} if checks is None else {"checks": facts_of_checks(checks)}
         more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats}
         print_json(
             {**about, **more, "settings": manifest["settings"], "provenance": manifest["provenance"]} | recordings
@@ -62,6 +66,8 @@ def info(dataset: Path, as_json: bool) -> None:
     ]
     print_table(["array", "min", "max", "mean", "std"], limits)
     print_quality(data.stats)
+    if checks is not None:
+        print_checks(checks)
 
 
 def _numbers(values: list[float]) -> str:
@@ -73,7 +79,10 @@ def _numbers(values: list[float]) -> str:
 @click.argument("folder", type=PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def validate(folder: Path, as_json: bool) -> None:
-    """Check a dataset, a training run or an experiment: one line for each finding, exit code 3 if there is any."""
+    """Check a dataset, a training run or an experiment: one line for each finding, exit code 3 if there is any.
+
+    What spoke against a recording when it was labeled, too little to refuse it, is a warning on the error output.
+    """
     findings = []
     for finding in _findings_of(folder):
         findings.append(finding)
@@ -81,6 +90,7 @@ def validate(folder: Path, as_json: bool) -> None:
             echo(str(finding))
     if as_json:
         print_json([{"file": f.place, "problem": f.problem} for f in findings])
+    _warn_of_doubts(folder)
     if findings:
         raise DataError(f"{folder}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
     if not as_json:
@@ -100,6 +110,24 @@ def _findings_of(folder: Path) -> "Iterator[Finding]":
     from flowlab.storage.validation import validate
 
     return validate(folder)
+
+
+def _warn_of_doubts(folder: Path) -> None:
+    """Say what was doubtful of recordings, and which were never checked; what is damaged has been told of."""
+    from flowlab.pipeline.kept_checks import total_checks
+    from flowlab.storage.dataset import Dataset
+    from flowlab.storage.manifest import MANIFEST
+
+    totals = None
+    with suppress(FlowlabError):
+        totals = total_checks(Dataset(folder)) if (folder / MANIFEST).is_file() else None
+    if totals is None:
+        return
+    for episode in totals.doubtful:
+        for check in episode.doubtful:
+            say(f"warning: {episode.shard}: {episode}: {check.about} is {check.verdict}: {check.says}")
+    if totals.not_checked:
+        say(f"warning: {folder}: {totals.not_checked} episodes were labeled without checks, by an earlier flowlab")
 
 
 def _reservation(folder: Path) -> str:

@@ -1,10 +1,15 @@
 """What a dry run says of recordings: JSON values, or lines for people."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+from flowlab.errors import UsageError
+from flowlab.perception.observer import Box
 from flowlab.pipeline.inspection import InspectedRecording
 from flowlab.recordings.recording import StreamInfo
+from flowlab.storage.recorded import Recorded
+from flowlab.text import file_name
 
 _SHOWN = 5
 """Bad frames that people are shown of one recording; JSON has all."""
@@ -35,6 +40,33 @@ def facts_of(one: InspectedRecording) -> dict[str, Any]:
     }
 
 
+def sheet_paths(png: Path, recordings: Sequence[Recorded]) -> dict[Recorded, Path]:
+    """Where the sheet of each recording is drawn: ``png`` of the only one, else a name with that of the recording."""
+    if png.suffix.lower() != ".png":
+        raise UsageError(
+            f"{png}: a sheet is a picture whose name ends with .png, as in --png {png.with_suffix('.png')}"
+        )
+    if len(recordings) == 1:
+        return {recordings[0]: png}
+    paths: dict[Recorded, Path] = {}
+    for one in recordings:
+        name = png.with_name(f"{png.stem}-{file_name(f'{one.task}-{one.name}')}.png")
+        paths[one] = name.with_stem(f"{name.stem}-{one.seed}") if name in paths.values() else name
+    return paths
+
+
+def draw_sheet(one: InspectedRecording, png: Path, crop: Box | None) -> None:
+    """Draw the sheet of a recording."""
+    from flowlab.viz.recording_sheet import draw_recording_sheet
+
+    found, preview = one.description, one.preview
+    assert preview is not None
+    checks = () if found is None else found.checks
+    rows = "" if found is None else f"   {found.rows} rows, read as a {found.reader} recording"
+    title = f"{one.recorded.task}/{one.recorded.name}{rows}"
+    draw_recording_sheet(preview, png, title=title, checks=checks, problem=one.problem, crop=crop)
+
+
 def _stream(s: StreamInfo) -> dict[str, Any]:
     about = {"stream": s.name, "count": s.count, "fps": round(s.fps, 2)}
     return {**about, "first_s": s.first_s, "last_s": s.last_s, "gaps_s": [list(gap) for gap in s.gaps]}
@@ -49,6 +81,8 @@ def lines_of(facts: dict[str, Any]) -> Iterator[str]:
             yield f"  {name:<12} {value}"
     if facts["problem"]:
         yield f"  {'problem':<12} {facts['problem']}"
+    if "sheet" in facts:
+        yield f"  {'sheet':<12} {facts['sheet']}"
 
 
 def _known(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:

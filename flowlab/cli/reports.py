@@ -5,9 +5,11 @@ from typing import Any
 
 from flowlab.cli.console import echo, print_json, print_table, say
 from flowlab.errors import DataError
+from flowlab.pipeline.kept_checks import CheckTotals
 from flowlab.pipeline.units import JobShard
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.overview import frame_count, left_out_frames, stage_totals, task_totals
+from flowlab.text import cut
 
 _SHOWN = 10
 """So many bad frames and rejects are printed; the rest is in files."""
@@ -59,6 +61,27 @@ def print_quality(about: dict[str, Any]) -> None:
         f"stated error of visible points: median {seen['p50'] * 1e3:.2g} mm, 90 % below {seen['p90'] * 1e3:.2g} mm; "
         f"{quality['visible_share']:.0%} of all positions visible; {shares}"
     )
+
+
+def facts_of_checks(totals: CheckTotals) -> dict[str, Any]:
+    """What was found when recordings were checked, as JSON values; of single checks, the doubtful ones."""
+    doubtful = [
+        {"task": e.task, "seed": e.seed, "recording": e.recording, "checks": [c.to_json() for c in e.doubtful]}
+        for e in totals.doubtful
+    ]
+    return {"verdicts": totals.verdicts, "episodes_not_checked": totals.not_checked, "doubtful": doubtful}
+
+
+def print_checks(totals: CheckTotals) -> None:
+    """What was found when recordings were checked: how many of each verdict, and the doubts."""
+    counts = ", ".join(f"{n} {verdict}" for verdict, n in totals.verdicts.items() if n)
+    missing = f"{totals.not_checked} episodes not checked" if totals.not_checked else ""
+    echo(f"checks of recordings: {'; '.join(filter(None, (counts, missing)))}")
+    doubts = [(episode, check) for episode in totals.doubtful for check in episode.doubtful]
+    for episode, check in doubts[:_SHOWN]:
+        echo(f"  {check.verdict}: {episode}: {check.about}: {cut(check.says, 160)}")
+    if len(doubts) > _SHOWN:
+        echo(f"  ... and {len(doubts) - _SHOWN} more; --json has all")
 
 
 def print_extraction(report: dict[str, Any]) -> None:

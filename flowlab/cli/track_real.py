@@ -2,15 +2,18 @@
 
 import json
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
+from flowlab.cli.console import ProgressBar, echo, print_json, say, show_extraction
 from flowlab.cli.paths import PATH
 from flowlab.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from flowlab.pipeline.recipe import Recipe
 
 
 @click.command("track-real")
@@ -30,6 +33,7 @@ from flowlab.errors import DataError, UsageError
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what is recognized; write nothing.")
+@click.option("--png", type=PATH, help="With --dry-run: draw a sheet of each recording here, to look at.")
 @click.option("--estimate", is_flag=True, help="With --dry-run: label some frames to tell how long all would take.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def track_real(
@@ -49,15 +53,19 @@ def track_real(
     shard: str,
     repair: bool,
     dry_run: bool,
+    png: Path | None,
     estimate: bool,
     as_json: bool,
 ) -> None:
     """Make a dataset of every RGB-D recording at or below the given paths, with estimated 3D-flow labels.
 
     \b
-      flowlab track-real recordings/pour --dry-run
+      flowlab track-real recordings/pour --dry-run --png sheet.png
       flowlab track-real recordings/pour --out data/pour
       flowlab track-real recordings --out data/all --tracker cotracker3 --chunk 33 --stride 8
+
+    The sheet that --png draws has pictures with edges of depth over them, the cloud from above, all streams over time,
+    and what was checked; of several recordings each has its own, SHEET-TASK-NAME.png.
 
     An existing dataset with the same settings is continued or extended; recordings that are new get new numbers.
     """
@@ -68,14 +76,18 @@ def track_real(
     share = JobShard.parse(shard)
     if out is None and not dry_run:
         raise UsageError("name the folder of the dataset, as in --out data/pour; or look first with --dry-run")
-    known = {"tracker": tracker, "calibration": calibration, "weights": weights}
+    if png is not None and not dry_run:
+        raise UsageError("--png is about what is recognized; add --dry-run")
+    known: dict[str, Any] = {"tracker": tracker, "calibration": calibration, "weights": weights}
     if out is None or dry_run:
-        _dry_run(paths, task, workers, as_json, estimate, recipe=recipe, settings=changes, **known)
+        _dry_run(paths, task, workers, as_json, estimate, png, recipe=recipe, settings=changes, **known)
         return
     from flowlab.cli.reports import finish_extraction
-    from flowlab.pipeline.labeling import label
+    from flowlab.pipeline.labeling import label, labeling_recipe
 
     start = time.monotonic()
+    if not as_json:
+        _say_if_compiling(labeling_recipe(recipe, changes, **known))
     with ProgressBar(quiet=as_json) as bar:
         dataset = label(
             paths, out, task=task, tracker=tracker, calibration=calibration, weights=weights, recipe=recipe,
@@ -85,23 +97,45 @@ def track_real(
     finish_extraction(dataset, time.monotonic() - start, share, as_json)
 
 
+def _say_if_compiling(recipe: "Recipe") -> None:
+    """Tell why the first labeling on a machine takes longer to begin."""
+    from flowlab.pipeline.compilation import NOTICE, will_compile
+
+    if will_compile(recipe):
+        say(f"flowlab: {NOTICE}")
+
+
 def _dry_run(
-    paths: tuple[Path, ...], task: str | None, workers: int | None, as_json: bool, estimate: bool, **recipe: Any
+    paths: tuple[Path, ...],
+    task: str | None,
+    workers: int | None,
+    as_json: bool,
+    estimate: bool,
+    png: Path | None,
+    **recipe: Any,
 ) -> None:
-    """Say what is recognized of every recording, and if asked how long labeling would take."""
-    from flowlab.cli.inspected import facts_of, lines_of
-    from flowlab.pipeline.inspection import estimate_labeling, frame_count, inspect_recordings
+    """Say what is recognized of every recording, draw it, and if asked tell how long labeling would take."""
+    from flowlab.cli.inspected import draw_sheet, facts_of, lines_of, sheet_paths
+    from flowlab.pipeline.inspection import estimate_labeling, frame_count, inspect_recordings, workspace
     from flowlab.pipeline.labeling import find_jobs, labeling_recipe
 
     chosen = labeling_recipe(**recipe)
-    inspected = []
-    for one in inspect_recordings(chosen, find_jobs(chosen, paths, task)):
-        inspected.append(one)
+    jobs = find_jobs(chosen, paths, task)
+    sheets = {} if png is None else sheet_paths(png, jobs)
+    inspected, facts = [], []
+    for one in inspect_recordings(chosen, jobs, previews=png is not None):
+        inspected.append(replace(one, preview=None))
+        facts.append(facts_of(one))
+        if sheet := sheets.get(one.recorded):
+            draw_sheet(one, sheet, workspace(chosen, one.recorded.task))
+            facts[-1]["sheet"] = str(sheet)
         if not as_json:
-            echo(*lines_of(facts_of(one)))
+            echo(*lines_of(facts[-1]))
+    if estimate and not as_json:
+        _say_if_compiling(chosen)
     plan = asdict(estimate_labeling(chosen, inspected, workers)) if estimate else {"frames": frame_count(inspected)}
     if as_json:
-        print_json({"recordings": [facts_of(one) for one in inspected]} | plan)
+        print_json({"recordings": facts} | plan)
     else:
         for name, value in plan.items():
             echo(f"{name.replace('_', ' '):<18} {value}")

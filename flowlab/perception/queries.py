@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Bool, Float32
 from pydantic import Field
-from scipy.ndimage import binary_dilation
 
 from flowlab.config import Settings
 from flowlab.errors import DataError
@@ -84,6 +83,8 @@ def away_from_edges(cloud: Cloud, depth: Float32[np.ndarray, "H W"], settings: E
 
 def near_edges(depth: Float32[np.ndarray, "H W"], settings: EdgeSettings) -> Bool[np.ndarray, "H W"]:
     """Which pixels lie within the margin of an edge or a hole of a depth picture [m], 0 where there is no reading."""
+    from scipy.ndimage import binary_dilation  # heavy, and a dry run does not need it
+
     edge = ~(depth > 0)
     for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         nearer = np.minimum(depth[a], depth[b])

@@ -9,11 +9,16 @@ from typing import Any
 
 from flowlab.engines.base import core_count
 from flowlab.errors import DataError
+from flowlab.perception.observer import Box
 from flowlab.pipeline.labeling import recording_stage
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
+from flowlab.pipeline.stages.observe import ObserverStage
 from flowlab.pipeline.stages.recording import QualityStage, TrackStage
-from flowlab.recordings.recording import Recording, RecordingDescription, describe
+from flowlab.recordings.description import RecordingDescription, describe_parsed
+from flowlab.recordings.parsing import parse_recording
+from flowlab.recordings.preview import RecordingPreview, preview_recording
+from flowlab.recordings.recording import Recording
 from flowlab.storage.recorded import Recorded
 from flowlab.tracking.base import make_tracker
 
@@ -30,16 +35,30 @@ class InspectedRecording:
     """None where nothing could be recognized."""
     problem: str | None
     """Why it cannot be labeled as it is; None where it can."""
+    preview: RecordingPreview | None = None
+    """What can be shown of it; None where that was not asked for."""
 
 
-def inspect_recordings(recipe: Recipe, recordings: Sequence[Recorded]) -> Iterator[InspectedRecording]:
-    """What is recognized of every recording, one after the other."""
+def inspect_recordings(
+    recipe: Recipe, recordings: Sequence[Recorded], *, previews: bool = False
+) -> Iterator[InspectedRecording]:
+    """What is recognized of every recording, one after the other, and if asked what can be shown of it."""
+    settings = recording_stage(recipe)
     for recorded in recordings:
+        path, source = Path(recorded.source), None
         try:
-            found = describe(Path(recorded.source), recording_stage(recipe))
-            yield InspectedRecording(recorded, found, found.problem)
+            source = parse_recording(path, settings)
+            found = describe_parsed(source, settings)
+            one = InspectedRecording(recorded, found, found.problem)
         except DataError as error:
-            yield InspectedRecording(recorded, None, str(error))
+            one = InspectedRecording(recorded, None, str(error))
+        yield replace(one, preview=preview_recording(path, settings, source)) if previews else one
+
+
+def workspace(recipe: Recipe, task: str) -> Box | None:
+    """The box in which points of a task are kept; None where the recipe has no observer."""
+    observer = next((s for s in recipe.stages if isinstance(s, ObserverStage)), None)
+    return None if observer is None else observer.crop_for(task)
 
 
 def frame_count(inspected: Sequence[InspectedRecording]) -> int:

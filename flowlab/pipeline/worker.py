@@ -15,7 +15,15 @@ from flowlab.pipeline.stage import Pipeline, Rejected
 from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode
 from flowlab.storage import stats
-from flowlab.storage.receipts import Receipt, Reject, Widths, keep_receipt, known_widths, shard_path
+from flowlab.storage.receipts import (
+    Receipt,
+    Reject,
+    RowFormat,
+    common_format,
+    keep_receipt,
+    known_row_format,
+    shard_path,
+)
 from flowlab.storage.recorded import CONTENT
 from flowlab.storage.shard import episode_digest
 
@@ -48,13 +56,14 @@ def run_unit(
             about = request.model_dump()
             why = {"stage": rejected.stage, "reason": rejected.reason, "retry": rejected.retry}
             rejects.append(Reject(**about, **why, position=position))
-    known = known_widths(folder)
+    known = known_row_format(folder)
     with nullcontext() if known else locked(folder):  # the first episodes decide, and only one unit has them
-        episodes, misfits = _fitting(episodes, known or known_widths(folder), unit)
+        episodes, misfits = _fitting(episodes, known or known_row_format(folder), unit)
         checksums = {
             place: _store(pipeline, folder, place, unit.name, found, settings_digest)
             for place, found in (("shards", episodes), ("rejects", kept))
         }
+        common = common_format(map(RowFormat.of, episodes))
         receipt = Receipt(
             unit=unit.name,
             task=unit.task,
@@ -67,6 +76,8 @@ def run_unit(
             rejects_sha256=checksums["rejects"],
             rejects=(*rejects, *misfits),
             stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
+            state_names=common.state_names if common else (),
+            action_names=common.action_names if common else (),
             stats=stats.summarize(episodes) if episodes else {},
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )
@@ -80,8 +91,10 @@ def _contents(unit: WorkUnit, episodes: Sequence[Episode]) -> tuple[str, ...]:
     return tuple(opened.get(seed, content) for seed, content in zip(unit.seeds, unit.contents, strict=False))
 
 
-def _fitting(episodes: Sequence[Episode], known: Widths | None, unit: WorkUnit) -> tuple[list[Episode], list[Reject]]:
-    """The episodes that are as wide as the dataset's, and why the others are not kept.
+def _fitting(
+    episodes: Sequence[Episode], known: RowFormat | None, unit: WorkUnit
+) -> tuple[list[Episode], list[Reject]]:
+    """The episodes whose state and action are the dataset's, and why the others are not kept.
 
     Raises :class:`DataError` in simulation, where the next seed would be no better.
     """
@@ -89,14 +102,14 @@ def _fitting(episodes: Sequence[Episode], known: Widths | None, unit: WorkUnit) 
     misfits: list[Reject] = []
     sources = {request.seed: request.source for request in unit.requests}
     for episode in episodes:
-        widths = Widths(episode.state.shape[1], episode.action.shape[1])
-        known = known or widths
-        problem = known.problem(widths)
+        found = RowFormat.of(episode)
+        problem = known.problem(found) if known else ""
         source = sources.get(episode.seed, "")
         if not problem:
+            known = found.or_names_of(known)
             fitting.append(episode)
         elif source:
-            reason = f"{problem}; give it as many, or label it into another --out"
+            reason = f"{problem}; choose the same ones in the same order, or label it into another --out"
             misfits.append(
                 Reject(task=unit.task, seed=episode.seed, stage="write", reason=reason, source=source, retry=True)
             )

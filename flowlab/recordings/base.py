@@ -80,6 +80,8 @@ class Streams:
     """What the reader looked at, and what came of it."""
     poses: SampleStream | None = None
     """Of a color camera that moves, see :func:`flowlab.recordings.poses.pose_stream`."""
+    used: tuple[str, ...] | None = None
+    """The files and folders below a recording that it is made of; None where the reader does not say."""
 
 
 @runtime_checkable

@@ -178,6 +178,11 @@ def find_repeats(
     return bad, Check("repeats", verdict, says)
 
 
+def repeated_pictures(digests: Mapping[int, PictureDigest]) -> Int64[np.ndarray, "R"]:
+    """The pictures that are the same as the one looked at before."""
+    return np.array([b for a, b in pairwise(sorted(digests)) if _equal(digests[a], digests[b])], np.int64)
+
+
 def _name(stream: ImageStream, rows: Int64[np.ndarray, "T 2"], row: int, which: int) -> str:
     return stream.names[int(rows[row][which])]
 

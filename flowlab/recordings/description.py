@@ -12,7 +12,7 @@ from flowlab.recordings.base import channel_names
 from flowlab.recordings.frame_check import BadFrame
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.metadata import Metadata
-from flowlab.recordings.parsing import RecordingSettings, parse_recording
+from flowlab.recordings.parsing import ParsedRecording, RecordingSettings, parse_recording
 from flowlab.recordings.sync import find_gaps, sampling_rate
 from flowlab.recordings.verdicts import Check, raise_refused
 
@@ -68,7 +68,12 @@ class RecordingDescription:
 
 def describe(path: Path, settings: RecordingSettings) -> RecordingDescription:
     """What is recognized of a recording, even where it cannot be opened for want of calibration."""
-    source = parse_recording(Path(path), settings)
+    return describe_parsed(parse_recording(Path(path), settings), settings)
+
+
+def describe_parsed(source: ParsedRecording, settings: RecordingSettings) -> RecordingDescription:
+    """What is recognized of a recording whose layout is understood."""
+    path = source.path
     seen, streams, problem, frame_size = source.frame_check, source.streams, None, None
     try:
         raise_refused(path, source.streams.checks)  # why frames are bad, where their clock is

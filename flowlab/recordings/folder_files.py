@@ -60,6 +60,18 @@ def _below(path: Path, name: str, above: tuple[tuple[int, int], ...]) -> Iterato
             yield from _below(path / inner, f"{name}/{inner}" if name else inner, inside)
 
 
+def no_files_below(path: Path) -> Iterator[tuple[str, str]]:
+    """What is below a folder and is neither a regular file nor a folder: its name, and what it is."""
+    for parent, folders, names in os.walk(path):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in sorted(names, key=natural_key):
+            file = Path(parent, name)
+            if name.startswith(".") or file.is_file():
+                continue
+            what = "a link that leads nowhere" if file.is_symlink() and not file.exists() else "no regular file"
+            yield file.relative_to(path).as_posix(), what
+
+
 def entries(folder: Path) -> list[str]:
     """The names of what is in a folder and not hidden, in natural order. Raises :class:`DataError`."""
     try:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
-from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks
+from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.poses import check_known, poses_at
@@ -51,6 +51,10 @@ class FrameCheck:
     """Small pictures of some rows, evenly spaced."""
     T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
     """The pose of a camera that moves, at every row."""
+    skipped: Int64[np.ndarray, "B"] = field(default_factory=lambda: np.empty(0, np.int64))
+    """Index of the color picture of every bad frame."""
+    repeated: Mapping[str, Int64[np.ndarray, "R"]] = field(default_factory=dict)
+    """Indices of the pictures of ``color`` and ``depth`` that are the same as the one looked at before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +106,7 @@ def check_frames(
         for i in np.unique(match[off <= max_sync_s])
     }
     color_size, depth_size = _usual_size(color.values()), _usual_size(depth.values())
-    good, bad, last = [], [], -np.inf
+    good, bad, skipped, last = [], [], [], -np.inf
     for k, (i, j) in enumerate(zip(frames.tolist(), match.tolist(), strict=True)):
         name = streams.color.names[i]
         fault = _fault(name, color[i], color_size)
@@ -116,6 +120,7 @@ def check_frames(
             fault = BadFrame(name, f"no pose: none at its time, and none on both sides within {_ms(pose_gap_s)}")
         if fault is not None:
             bad.append(fault)
+            skipped.append(i)
             continue
         good.append((i, j))
         last = clock[k]
@@ -125,6 +130,7 @@ def check_frames(
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
     checks = (repeats, *motion_checks(streams, digests[0], digests[1], stated))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
+    skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)
     T_world_cam = None
     if streams.poses is not None and poses is not None:
@@ -133,9 +139,11 @@ def check_frames(
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
+    repeated = {name: repeated_pictures(kept) for name, kept in zip(("color", "depth"), digests, strict=True)}
     return FrameCheck(
         rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples,
         T_world_cam,
+        np.array(skipped, np.int64), repeated,
     )  # fmt: skip
 
 

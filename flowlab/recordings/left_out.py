@@ -4,31 +4,30 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flowlab.recordings.folder_files import FoundFile, files_below
+from flowlab.recordings.folder_files import FoundFile, files_below, no_files_below
 from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.unused_files import by_folder, robot_numbers, some_of
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 
 if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
 
-_SHOWN = 5
 _NUMBERS = (".npy", ".csv", ".txt", ".tsv")
-_OF_ROBOTS = {
-    "state": ("state", "joint", "qpos", "agent_pos", "proprio", "tcp", "ee_pose", "eef", "gripper", "robot"),
-    "action": ("action", "command"),
-}  # fmt: skip
-"""What files of a robot's numbers are called."""
 _OF_CAMERAS = ("poses", "trajectory", "extrinsics", "camera_pose")
 
 
 def find_left_out(source: "ParsedRecording") -> Iterator[Check]:
     """What of a recording's folder is not used, and why."""
-    if not source.path.is_dir() or source.reader.name not in ("plain", "tum"):
-        return  # other readers take what they find, or do not say what they took
+    if not source.path.is_dir():
+        return  # what lies beside a file belongs to other recordings
     used = _used(source)
-    unused = [f for f in files_below(source.path) if f.name not in used]
+    if used is None:
+        says = f"the reader '{source.reader.name}' does not say which files it uses"
+        yield Check("left out", Verdict.ASSUMED, says)
+        return
+    unused = [f for f in files_below(source.path) if not _is_used(f.name, used)]
     asked: list[Check] = []
     for file in list(unused):
         if (check := _asked(source, file)) is not None:
@@ -38,17 +37,29 @@ def find_left_out(source: "ParsedRecording") -> Iterator[Check]:
     groups: dict[str, list[str]] = {}
     for file in unused:
         groups.setdefault(_reason(file), []).append(file.name)
-    says = "; ".join(f"{_some(names)} ({why})" for why, names in groups.items())
+    for name, why in no_files_below(source.path):
+        groups.setdefault(why, []).append(name)
+    says = "; ".join(f"{some_of(by_folder(names))} ({why})" for why, names in groups.items())
     yield Check("left out", Verdict.OK, says or "every file is used")
 
 
-def _used(source: "ParsedRecording") -> set[str]:
-    """The files that are used, by their names below the folder."""
+def _is_used(name: str, used: set[str]) -> bool:
+    """Whether a file, or a folder that it is in, is used."""
+    return name in used or any(folder.as_posix() in used for folder in Path(name).parents)
+
+
+def _used(source: "ParsedRecording") -> set[str] | None:
+    """The files that are used, by their names below the folder; None where that is not known."""
     known, path = source.metadata, source.path
-    used = {FILE_NAME, "intrinsic.json", "camera_intrinsic.json", "rgb.txt", "depth.txt", "ground_truth.npz"}
-    used |= {"associations.txt", "associated.txt", "associate.txt", "groundtruth.txt"}
+    used = {FILE_NAME}
     used |= {f for f in (known.times, known.depth_times, known.state, known.state_times, known.action,
                          known.action_times, known.T_world_cam_file, known.T_world_cam_times) if f}  # fmt: skip
+    if source.streams.used is not None:
+        return used | set(source.streams.used)
+    if source.reader.name not in ("plain", "tum"):
+        return None
+    used |= {"intrinsic.json", "camera_intrinsic.json", "rgb.txt", "depth.txt", "ground_truth.npz"}
+    used |= {"associations.txt", "associated.txt", "associate.txt", "groundtruth.txt"}
     pictures = (*source.streams.color.names, *source.streams.depth.names)
     folders = [Path(f) for f in (known.color, known.depth)]
     for name in pictures:
@@ -64,12 +75,8 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
     name = Path(file.name)
     if name.suffix.lower() not in _NUMBERS or len(name.parts) > 2:
         return None
-    for what, words in _OF_ROBOTS.items():
-        if (
-            name.stem.lower().startswith(words)
-            and not getattr(source.streams, what)
-            and "time" not in name.stem.lower()
-        ):
+    for what in ("state", "action"):
+        if robot_numbers(name.stem, what) and not getattr(source.streams, what):
             says = (
                 f"{cut(file.name)} is not used; if it is the {what}, write '{what}: {cut(file.name)}' into {FILE_NAME}"
             )
@@ -86,11 +93,6 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
 
 def _reason(file: FoundFile) -> str:
     return foreign_format(file.path) or "no stream uses it"
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return cut(", ".join(names[:_SHOWN])) + more
 
 
 def check_widths_known(source: "ParsedRecording") -> Iterator[Check]:

@@ -25,7 +25,7 @@ from flowlab.recordings.frame_check import FrameCheck
 from flowlab.recordings.frame_processing import FrameProcessor
 from flowlab.recordings.parsing import AlignedSamples, ParsedRecording, RecordingSettings, parse_recording
 from flowlab.recordings.sync import find_gaps
-from flowlab.recordings.verdicts import raise_refused
+from flowlab.recordings.verdicts import CHECKS, raise_refused
 from flowlab.records import Demonstration, Frame
 
 _LOG = logging.getLogger(__name__)
@@ -166,5 +166,5 @@ def _extras(source: ParsedRecording, processor: FrameProcessor, rows: AlignedSam
         "action": rows.action_source,
         "state_names": channel_names(streams.state),
         "action_names": channel_names(streams.action),
-        "checks": [check.to_json() for check in source.checks],
+        CHECKS: [check.to_json() for check in source.checks],
     }

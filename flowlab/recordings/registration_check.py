@@ -55,7 +55,7 @@ class Misalignment:
 def estimate_misalignment(samples: Sequence[PictureSample]) -> Misalignment | None:
     """How far depth is from lying on color; None where there are not enough edges to tell."""
     some = [samples[k] for k in np.unique(np.linspace(0, len(samples) - 1, min(_FRAMES, len(samples))).astype(int))]
-    pairs = [(_depth_edges(s.depth), _color_edges(s.gray)) for s in some if s.depth.shape == s.gray.shape]
+    pairs = [(depth_edges(s.depth), _color_edges(s.gray)) for s in some if s.depth.shape == s.gray.shape]
     pairs = [(d, c) for d, c in pairs if np.count_nonzero(d) >= _EDGES]
     if not pairs:
         return None
@@ -79,8 +79,15 @@ def estimate_misalignment(samples: Sequence[PictureSample]) -> Misalignment | No
     )
 
 
-def _depth_edges(counts: np.ndarray) -> Float32[np.ndarray, "2 H W"]:
-    """Where the nearer side of a jump in depth lies: across columns, and across rows."""
+def depth_edges(counts: np.ndarray) -> Float32[np.ndarray, "2 H W"]:
+    """Where the nearer side of a jump in depth lies: across columns, and across rows.
+
+    Args:
+        counts: Depth in any unit; what is not above 0 is no reading.
+
+    Returns:
+        1 at edges, else 0.
+    """
     depth = np.where(np.isfinite(counts) & (counts > 0), counts, 0).astype(np.float32)
     return np.stack([_jumps(depth), _jumps(depth.T).T])
 

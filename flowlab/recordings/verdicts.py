@@ -7,6 +7,9 @@ from typing import Any
 
 from flowlab.errors import DataError
 
+CHECKS = "checks"
+"""Where an episode's extras have them."""
+
 
 class Verdict(StrEnum):
     """What came of looking at something, the best first."""
@@ -39,6 +42,22 @@ class Check:
     def from_json(cls, values: Mapping[str, Any]) -> "Check":
         """The inverse of :meth:`to_json`."""
         return cls(str(values["about"]), Verdict(values["verdict"]), str(values["says"]))
+
+
+def stored_checks(extras: Mapping[str, Any]) -> tuple[Check, ...] | None:
+    """The checks that an episode was stored with.
+
+    Args:
+        extras: Of the episode.
+
+    Returns:
+        The checks in the order in which they were made; None where there are none, as in episodes of simulation and
+        of an earlier flowlab: these were not checked, which is not the same as ``ok``.
+    """
+    try:
+        return tuple(map(Check.from_json, extras[CHECKS]))
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def raise_refused(path: object, checks: Iterable[Check]) -> None:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flowlab.geometry.camera import pose_fault
 from flowlab.provenance import Provenance
@@ -162,6 +161,8 @@ def _off_surface(e: Episode) -> Iterator[ArrayProblem]:
     visible point, which is within a pixel of the cloud, is that near to the sample; unless it has left
     the crop, which the cloud's extent tells. Estimated points may be off by as much as they say.
     """
+    from scipy.spatial import cKDTree  # heavy, and nothing else of storage needs it
+
     far = total = 0
     quality = e.tracks.quality
     known = e.tracks.visible if quality is None else e.tracks.visible & (quality.source != PositionSource.FILLED)

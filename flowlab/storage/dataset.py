@@ -18,7 +18,7 @@ from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
 from flowlab.storage.episodes import EpisodeRef, EpisodeSequence, checked, unit_refs, unit_shard
 from flowlab.storage.manifest import MANIFEST, Manifest, differences
-from flowlab.storage.receipts import check_widths, read_receipts
+from flowlab.storage.receipts import check_row_formats, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.storage.shard import REPAIR, Shard
@@ -158,9 +158,9 @@ class Dataset(EpisodeSequence):
         """Limits, mean and deviation of every array, and how much moves.
 
         Raises:
-            DataError: Some episodes have wider states or actions than others.
+            DataError: States or actions of some episodes are others than those of the rest.
         """
-        check_widths(self.path, self.receipts)
+        check_row_formats(self.path, self.receipts)
         return stats.describe(stats.merge(r.stats for r in self.receipts if r.accepted))
 
     @property

@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 
 from pydantic import Field, ValidationError, model_validator
@@ -11,10 +12,11 @@ from flowlab.checksums import with_checksum, without_checksum
 from flowlab.config import PlainName, Settings, explain
 from flowlab.errors import DataError
 from flowlab.files import write_json
+from flowlab.records import Episode
 from flowlab.storage.migrations import migrate_receipt
 from flowlab.storage.shard_files import SUFFIX
 from flowlab.storage.stats import MergeableStats, stats_problem
-from flowlab.text import shown
+from flowlab.text import cut, shown
 from flowlab.untrusted import read_json
 from flowlab.version import __version__
 
@@ -57,18 +59,39 @@ class StageTally(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Widths:
-    """How many numbers a state and an action have, the same in all episodes of a dataset."""
+class RowFormat:
+    """What a state and an action are made of, the same in all episodes of a dataset."""
 
     state: int
+    """How many numbers it has."""
     action: int
+    state_names: tuple[str, ...] = ()
+    """What the numbers are called; empty where that is not known."""
+    action_names: tuple[str, ...] = ()
 
-    def problem(self, other: "Widths") -> str:
+    @classmethod
+    def of(cls, episode: Episode) -> "RowFormat":
+        """The format of an episode."""
+        state_names, action_names = (tuple(episode.extras.get(name, ())) for name in ("state_names", "action_names"))
+        return cls(episode.state.shape[1], episode.action.shape[1], state_names, action_names)
+
+    def or_names_of(self, other: "RowFormat | None") -> "RowFormat":
+        """The same, with the names of another where it has none of its own."""
+        if other is None:
+            return self
+        named = {f"{n}_names": getattr(other, f"{n}_names") or getattr(self, f"{n}_names") for n in ("state", "action")}
+        return replace(self, **named)
+
+    def problem(self, other: "RowFormat") -> str:
         """In what others differ from the dataset's, in words; empty where they do not."""
         for name in ("state", "action"):
             mine, found = getattr(self, name), getattr(other, name)
             if mine != found:
                 return f"its {name} has {found} numbers a step, that of the dataset's other episodes {mine}"
+            mine, found = getattr(self, f"{name}_names"), getattr(other, f"{name}_names")
+            if mine and found and mine != found:
+                theirs, ours = (cut(", ".join(map(repr, names))) for names in (found, mine))
+                return f"its {name} is {theirs}, that of the dataset's other episodes {ours}"
         return ""
 
 
@@ -95,6 +118,9 @@ class Receipt(Settings):
     stages: Mapping[str, StageTally] = {}
     stats: MergeableStats = Field(default_factory=MergeableStats)
     """Mergeable statistics of the episodes."""
+    state_names: tuple[str, ...] = ()
+    """What the numbers of the state are called; empty where that is not known, or not of all."""
+    action_names: tuple[str, ...] = ()
     peak_memory_mb: float = 0.0
     flowlab: str = __version__
 
@@ -112,12 +138,13 @@ class Receipt(Settings):
         return shard_path("shards", self.unit, zipped=bool(self.shard_sha256))
 
     @property
-    def widths(self) -> "Widths | None":
-        """How many numbers a state and an action of its episodes have; None where that is not known."""
+    def row_format(self) -> RowFormat | None:
+        """What a state and an action of its episodes are made of; None where that is not known."""
         if not self.accepted or "arrays" not in self.stats:
             return None
         moments = self.stats["arrays"]
-        return Widths(*(len(moments[name]["mean"]) if name in moments else 0 for name in ("state", "action")))
+        state, action = (len(moments[name]["mean"]) if name in moments else 0 for name in ("state", "action"))
+        return RowFormat(state, action, self.state_names, self.action_names)
 
     @property
     def rejects_shard(self) -> str:
@@ -135,24 +162,29 @@ def read_receipts(folder: Path) -> list[Receipt]:
     return sorted(_receipts(folder), key=lambda r: (r.task, r.seeds))
 
 
-def known_widths(folder: Path) -> Widths | None:
+def known_row_format(folder: Path) -> RowFormat | None:
     """What all episodes of a dataset have as state and action; None as long as there is no episode."""
-    return next((widths for receipt in _receipts(folder) if (widths := receipt.widths)), None)
+    return common_format(found for receipt in _receipts(folder) if (found := receipt.row_format))
 
 
-def check_widths(folder: Path, receipts: Iterable[Receipt]) -> None:
-    """Raises :class:`DataError` where some episodes of a dataset have wider states or actions than others."""
-    first: Receipt | None = None
+def common_format(formats: Iterable[RowFormat]) -> RowFormat | None:
+    """What fits all of some, with the names that any of them has; None where there are none."""
+    return reduce(lambda known, more: more.or_names_of(known), formats, None)
+
+
+def check_row_formats(folder: Path, receipts: Iterable[Receipt]) -> None:
+    """Raises :class:`DataError` where states or actions of some episodes are others than those of the rest."""
+    known, first = None, ""
     for receipt in receipts:
-        if receipt.widths is None:
+        if (found := receipt.row_format) is None:
             continue
-        first = first or receipt
-        assert first.widths is not None
-        if problem := first.widths.problem(receipt.widths):
+        first = first or receipt.unit
+        if problem := known.problem(found) if known else "":
             raise DataError(
-                f"{folder}: an episode does not fit, {problem} ({receipt.unit} and {first.unit}); a dataset has one "
-                f"width: make those of another one in another --out, and remove {folder}/receipts/{receipt.unit}.json"
+                f"{folder}: an episode does not fit, {problem} ({receipt.unit} and {first}); a dataset has one kind of "
+                f"each: make those of another in another --out, and remove {folder}/receipts/{receipt.unit}.json"
             )
+        known = found.or_names_of(known)
 
 
 def _receipts(folder: Path) -> Iterator[Receipt]:

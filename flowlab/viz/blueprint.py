@@ -11,6 +11,7 @@ from flowlab.viz.orientation import up_from_world
 CAMERA = "/world/camera/main"
 DEPTH = f"{CAMERA}/depth"
 RGB = f"{CAMERA}/rgb"
+INFO, CHECKS = "/info", "/checks"
 
 
 def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Blueprint:
@@ -20,7 +21,9 @@ def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Bluepri
         for entity, name, there in [(RGB, "rgb", episode.rgb), (DEPTH, "depth", episode.depth)]
         if there is not None
     ]
-    info = rrb.TextDocumentView(origin="/info", name="info")
+    texts = [rrb.TextDocumentView(origin=INFO, name="info")]
+    if "reader" in episode.extras:
+        texts.append(rrb.TextDocumentView(origin=CHECKS, name="checks"))
     plots = [_plot("action and success", ["+ /scalars/action/**", "+ /scalars/success"], legend=True)]
     if episode.state.shape[1] > 0:
         plots.insert(0, _plot("state", ["+ /scalars/state/**"], legend=episode.state.shape[1] <= 6))
@@ -39,7 +42,7 @@ def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Bluepri
         background=[18, 20, 24],
         line_grid=rrb.LineGrid3D(plane=floor, spacing=0.1, color=[52, 56, 62]),
     )
-    side = rrb.Vertical(rrb.Tabs(*pictures, info), *plots, row_shares=[4, *[6 / len(plots)] * len(plots)])
+    side = rrb.Vertical(rrb.Tabs(*pictures, *texts), *plots, row_shares=[4, *[6 / len(plots)] * len(plots)])
     return rrb.Blueprint(
         rrb.Horizontal(scene, side, column_shares=[7, 3]),
         rrb.TimePanel(state="collapsed", timeline="step", fps=20, play_state="playing", loop_mode="all"),

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from flowlab.geometry.moving import MOVING_IN_EPISODE_M
+from flowlab.recordings.verdicts import Verdict, stored_checks
 from flowlab.records import Episode, PositionSource, Role
 from flowlab.text import markdown
 from flowlab.viz.colors import SIGMA_LIMIT
@@ -79,6 +80,23 @@ def describe(episode: Episode) -> str:
     rows |= _describe_quality(episode)
     lines = [f"| {key} | {markdown(str(value))} |" for key, value in rows.items()]
     return "\n".join([lines[0], "|---|---|", *lines[1:]])
+
+
+def describe_checks(episode: Episode) -> str:
+    """What was found when the recording of an episode was checked, the worst first, as a Markdown table.
+
+    Returns:
+        The table, or a sentence where nothing was checked; empty for episodes that were not recorded.
+    """
+    if "reader" not in episode.extras:
+        return ""
+    checks = stored_checks(episode.extras)
+    if checks is None:
+        return "The recording was not checked: it was labeled by an earlier flowlab."
+    order = list(Verdict)
+    told = sorted(checks, key=lambda check: -order.index(check.verdict))
+    lines = [f"| {c.verdict} | {markdown(c.about)} | {markdown(c.says)} |" for c in told]
+    return "\n".join(["| verdict | about | what was found |", "|---|---|---|", *lines])
 
 
 def _describe_quality(episode: Episode) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """One look for all figures: colors, axes, headings, and how they are written."""
 
 import colorsys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,7 +95,8 @@ def hide_frame(axes: Axes) -> None:
 @plain_style()
 def save_png(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, the same bytes for the same figure. ``path`` is either absent, as before, or whole."""
-    with output_file(path) as temporary:
+    with output_file(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # names in other scripts show as boxes, and that is all
         figure.savefig(temporary, format="png", facecolor="white", metadata={"Software": None})
 
 

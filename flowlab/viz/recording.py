@@ -13,8 +13,8 @@ from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode, FlowPrediction
 from flowlab.text import one_line
-from flowlab.viz.blueprint import CAMERA, DEPTH, RGB, make_blueprint, scene_size
-from flowlab.viz.captions import describe
+from flowlab.viz.blueprint import CAMERA, CHECKS, DEPTH, INFO, RGB, make_blueprint, scene_size
+from flowlab.viz.captions import describe, describe_checks
 from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
 from flowlab.viz.orientation import world_is_camera_frame
 from flowlab.viz.plan_predictions import PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
@@ -57,7 +57,9 @@ def write_rrd(
             if errors:
                 _send_flow_error(recording, episode, errors)
             legend = f"\n\n{_LEGEND}" if plans else ""
-            _send_info(recording, f"{about}\n\n{describe(episode)}{legend}")
+            _send_text(recording, INFO, f"{about}\n\n{describe(episode)}{legend}")
+            if checks := describe_checks(episode):
+                _send_text(recording, CHECKS, checks)
             content = stream.read()
     finally:
         recording.disconnect()
@@ -82,9 +84,9 @@ def _times(episode: Episode, steps: Sequence[int] | None = None) -> list[rr.Time
     return [rr.TimeColumn("step", sequence=rows), rr.TimeColumn("time", duration=episode.time_s[rows])]
 
 
-def _send_info(recording: rr.RecordingStream, text: str) -> None:
-    """The info panel."""
-    recording.log("/info", rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN), static=True)
+def _send_text(recording: rr.RecordingStream, panel: str, text: str) -> None:
+    """A panel of text."""
+    recording.log(panel, rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:

@@ -59,7 +59,7 @@ class Arena:
         return self.top / "markers"
 
     def run(self, *arguments: str | Path, before: Callable[[], None] = lambda: None) -> Ended:
-        self.ended.append(call(arguments, self.here, before=before, limit=60))
+        self.ended.append(call(arguments, self.here, before=before, limit=180))
         return self.ended[-1]
 
     def run_program(self, *arguments: str | Path, **environment: str) -> Ended:
@@ -164,7 +164,7 @@ def _judge(arena: Arena, before: dict[str, str]) -> Iterator[tuple[str, str]]:
             found = True
             yield (
                 ("hung" if e.code == HUNG else "traceback" if e.traceback else "escape"),
-                e.err[-1500:] or e.out[-300:],
+                e.err[-6000:] or e.out[-300:],
             )
     if arena.believed:
         found = True

@@ -2,6 +2,7 @@
 
 import atexit
 import ctypes
+import faulthandler
 import os
 import pkgutil
 import shutil
@@ -88,9 +89,12 @@ def call(
     start = time.monotonic()
     child = os.fork()
     if child == 0:
+        faulthandler.dump_traceback_later(0.95 * limit, file=os.open(logs / "stacks", os.O_WRONLY | os.O_CREAT))
         _run([str(a) for a in arguments], folder, logs, before, environment or {}, faults.seen)
     code = _wait(child, start, kill_after, limit)
-    out, err = ((logs / name).read_text(errors="backslashreplace") for name in ("out", "err"))
+    out, err, stacks = ((logs / name).read_text(errors="backslashreplace") for name in ("out", "err", "stacks"))
+    if code == HUNG:
+        err += f"{' '.join(map(str, arguments))} took more than {limit} s\n{stacks}"
     count = logs / "operations"
     operations = int(count.read_text()) if count.exists() else -1
     return Ended(code, out, err, time.monotonic() - start, operations)

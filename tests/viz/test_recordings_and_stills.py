@@ -320,6 +320,17 @@ def test_error_and_visibility_are_plotted_over_time(real: Episode, tmp_path: Pat
     assert kinds.count("TimeSeries") == 3
 
 
+def test_checks_of_a_recording_have_a_panel(real: Episode, tmp_path: Path) -> None:
+    assert ("/checks", "TextDocument:text") not in recorded(real, tmp_path)
+    checks = [
+        {"about": "clock", "verdict": "ok", "says": "fine"},
+        {"about": "x", "verdict": "doubtful", "says": "<b>|"},
+    ]
+    found = recorded(replace(real, extras={**real.extras, "reader": "plain", "checks": checks}), tmp_path)
+    text = found["/checks", "TextDocument:text"][0][0]
+    assert text.splitlines()[2:] == [r"| doubtful | x | \<b\>\| |", "| ok | clock | fine |"]
+
+
 def test_info_says_who_tracked_and_how_well(real: Episode) -> None:
     text = describe(real)
     for row in (

@@ -16,7 +16,9 @@ from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
-from flowlab.text import cut
+from flowlab.recordings.unused_files import robot_numbers, some_of
+from flowlab.recordings.verdicts import Check, Verdict
+from flowlab.text import cut, natural_key
 
 NAMES = {
     "color": ("color", "rgb", "img", "image", "images", "colors"),
@@ -108,22 +110,45 @@ class ArraysReader:
             action=_samples(store, "action", *stamps),
             known=known,
             poses=poses,
+            checks=_unused_members(path, names),
+            used=tuple(f"{name}.npy" for what, name in names.items() if what != "cloud"),
         )
 
 
 def _find(path: Path) -> dict[str, str]:
     """What arrays there are, by name; nothing is read of them."""
-    if path.suffix == ".npz" and path.is_file():
-        try:
-            with zipfile.ZipFile(path) as file:
-                present = {n.removesuffix(".npy") for n in file.namelist()}
-        except (OSError, zipfile.BadZipFile):
-            return {}
-    elif path.is_dir():
-        present = {f.stem for f in path.glob("*.npy")}
-    else:
-        return {}
+    present = _members(path) if path.is_file() else {f.stem for f in path.glob("*.npy")}
     return {what: name for what, names in NAMES.items() for name in reversed(names) if name in present}
+
+
+def _members(path: Path) -> set[str]:
+    """Names of the arrays in an ``.npz`` file."""
+    if path.suffix != ".npz":
+        return set()
+    try:
+        with zipfile.ZipFile(path) as file:
+            return {n.removesuffix(".npy") for n in file.namelist()}
+    except (OSError, zipfile.BadZipFile):
+        return set()
+
+
+def _unused_members(path: Path, names: dict[str, str]) -> tuple[Check, ...]:
+    """The arrays of an ``.npz`` file that no stream uses, by name; those of a folder are files."""
+    if path.is_dir():
+        return ()
+    used = {name for what, name in names.items() if what != "cloud"}
+    unused = sorted(_members(path) - used, key=natural_key)
+    if not unused:
+        return (Check("left out", Verdict.OK, "every array is used"),)
+    wanted = ", ".join(what for what in ("state", "action") if what not in names)
+    hint = f"; one that is the {wanted.replace(', ', ' or the ')} must be called so" if wanted else ""
+    says = f"{some_of(unused)} (no stream uses them{hint})"
+    return (Check("left out", Verdict.DOUBTFUL if _of_robots(unused, names) else Verdict.OK, says),)
+
+
+def _of_robots(unused: list[str], names: dict[str, str]) -> bool:
+    """Whether some of these look like the state or the action, of which there is none by its usual name."""
+    return any(robot_numbers(name, what) for name in unused for what in ("state", "action") if what not in names)
 
 
 def _called(name: str, count: int) -> tuple[str, ...]:

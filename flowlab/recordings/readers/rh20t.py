@@ -63,8 +63,25 @@ class RH20TReader:
             state=_state([folder, episode]),
             known=(*calibration, (custom, known)),
             registered=True,
-            checks=checks,
+            checks=(*checks, *_after_finish(folder, len(color[0]))),
+            used=_used(path, folder),
         )
+
+
+def _used(path: Path, folder: Path) -> tuple[str, ...]:
+    """The files and folders of an episode that are looked at, below the recording."""
+    of_episode = [folder.parent / name for name in ("metadata.json", "timestamp.txt", *STATE)]
+    of_camera = [folder / name for name in ("color", "depth", *STATE)]
+    taken = [f for f in (*of_camera, *of_episode) if f.is_relative_to(path)]
+    twice = [f for f in taken if f.parent == folder.parent and f.name in STATE and (folder / f.name).is_dir()]
+    return tuple(f.relative_to(path).as_posix() for f in taken if f not in twice)
+
+
+def _after_finish(folder: Path, count: int) -> tuple[Check, ...]:
+    """What is said of color pictures that were taken after the end of the demonstration."""
+    late = len(list_images(folder / "color", COLOR_SUFFIXES)) - count
+    says = f"{late} color pictures after the 'finish_time' of metadata.json are not used"
+    return (Check("finish time", Verdict.OK, says),) if late else ()
 
 
 def _has_pictures(folder: Path) -> bool:

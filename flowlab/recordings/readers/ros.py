@@ -87,6 +87,7 @@ class ROSReader:
             registered=registered,
             checks=tuple(checks),
             poses=poses,
+            used=bag.files(),
         )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,6 +55,12 @@ class RosBag:
                 self._counts = {topic: int(about.msgcount) for topic, about in self._reader.topics.items()}
         except Exception as error:  # rosbags lets through what its parsers raise
             raise DataError(f"{path}: is no readable ROS recording ({_words(error)})") from error
+
+    def files(self) -> tuple[str, ...]:
+        """The files of a folder that are read: those that its ``metadata.yaml`` names, and this."""
+        if not self.path.is_dir():
+            return (self.path.name,)
+        return ("metadata.yaml", *_listed(self.path))
 
     def topics(self, *types: str) -> dict[str, int]:
         """Topics that hold messages of these types, with how many."""
@@ -133,10 +139,17 @@ def _check_files(path: Path) -> None:
     if not path.is_dir():
         check_regular(path, MAX_ARRAY_BYTES)
         return
+    for name in _listed(path):
+        if (path / name).exists():
+            check_regular(path / name, MAX_ARRAY_BYTES)
+
+
+def _listed(folder: Path) -> list[str]:
+    """The files that ``metadata.yaml`` names, of which rosbags reads nothing but those beside it."""
     try:
-        parse_yaml(read_text(path / "metadata.yaml", _MAX_METADATA_BYTES))
+        about = parse_yaml(read_text(folder / "metadata.yaml", _MAX_METADATA_BYTES))
+        return [PurePath(name).name for name in about["rosbag2_bagfile_information"]["relative_file_paths"]]
     except ValueError as error:
-        raise DataError(f"{path / 'metadata.yaml'}: not valid YAML ({first_line(error)})") from error
-    for file in path.iterdir():
-        if not file.is_dir():
-            check_regular(file, MAX_ARRAY_BYTES)
+        raise DataError(f"{folder / 'metadata.yaml'}: not valid YAML ({first_line(error)})") from error
+    except (KeyError, TypeError):
+        return []
