@@ -1,24 +1,17 @@
-"""What pictures hold: depth that stands for no reading, and pictures that come again and again."""
+"""What pictures hold: how much they change, and pictures that come again and again."""
 
 import zlib
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Int64, Num
 
-from flowlab.recordings.base import BadImage, ImageStream, Streams
+from flowlab.recordings.base import ImageStream, Streams
 from flowlab.recordings.motion import Motion, check_motion
 from flowlab.recordings.verdicts import Check, Verdict
 
-_SAMPLES = 5
-"""Depth pictures that are looked at for readings that are none."""
-_FAR = 3.0
-"""A greatest reading this many times the median of the others, and often, is that of a plane where nothing was."""
-_FAR_SHARE = 0.02
 _RUN = 3
 """So many equal pictures in a row are no accident."""
 _MANY = 0.1
@@ -75,59 +68,6 @@ def motion_checks(
             change = np.linalg.norm(np.diff(s.values, axis=0) / reach, axis=1).astype(np.float64)
             found.append(check_motion(pictures, Motion.make("the robot", s.time_s, change), "state" in stated))
     return tuple(found)
-
-
-# --- readings that are none -------------------------------------------------------------------------------
-
-
-def without_saturated(streams: Streams) -> Streams:
-    """The same streams, their depth without readings that stand for none, and with a check that says so."""
-    depth = streams.depth
-    found, shares = [], []
-    for i in np.unique(np.linspace(0, len(depth) - 1, _SAMPLES).astype(int)):
-        try:
-            counts = depth.read(int(i))
-        except BadImage:
-            continue
-        if counts.ndim == 2 and counts.dtype.kind in "iuf" and (value := _saturated(counts)) is not None:
-            found.append(value)
-            shares.append(float((counts == value).mean()))
-    value, times = Counter(found).most_common(1)[0] if found else (None, 0)
-    far = value if times >= _RUN or times == len(depth) else None
-    masked = replace(depth, read=partial(_read_masked, depth.read, far))
-    if value is None:
-        check = Check("saturated depth", Verdict.OK, "no reading is that of a limit")
-    elif far is None and value != _limit(np.dtype(np.uint16)):
-        return replace(streams, depth=masked)
-    else:
-        says = f"{value:g} counts are taken as no reading: the greatest, in {np.mean(shares):.1%} of the pixels"
-        check = Check("saturated depth", Verdict.ASSUMED, says)
-    return replace(streams, depth=masked, checks=(*streams.checks, check))
-
-
-def _limit(dtype: np.dtype) -> float | None:
-    """The greatest number of a type of 16 bits."""
-    return float(np.iinfo(dtype).max) if dtype.kind in "iu" and dtype.itemsize == 2 else None
-
-
-def _saturated(counts: Num[np.ndarray, "H W"]) -> float | None:
-    """The reading of a picture that stands for none; None where there is none."""
-    readings = counts[np.isfinite(counts) & (counts > 0)]
-    if not readings.size:
-        return None
-    most = float(readings.max())
-    if most == _limit(counts.dtype):
-        return most
-    others = readings[readings < most]
-    often = 1 - others.size / readings.size >= _FAR_SHARE
-    return most if often and others.size and most >= _FAR * float(np.median(others)) else None
-
-
-def _read_masked(read: Callable[[int], np.ndarray], far: float | None, index: int) -> np.ndarray:
-    """Decode a depth picture; readings that are none are 0."""
-    counts = read(index)
-    none = [value for value in (far, _limit(counts.dtype)) if value is not None]
-    return np.where(np.isin(counts, none), 0, counts) if none and np.isin(counts, none).any() else counts
 
 
 # --- pictures that come again -----------------------------------------------------------------------------

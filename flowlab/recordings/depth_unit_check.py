@@ -20,6 +20,8 @@ _WORKSPACE_M = (0.15, 5.0)
 """A camera that sees a robot at work has its median depth between these [m]."""
 _SENSED_M = (0.15, 10.0)
 """Where depth cameras measure [m]."""
+_MOST = 0.9
+"""So many of the readings must lie there."""
 _SATURATED = 65535
 _VARIED = 50
 """So many different readings tell the step between them."""
@@ -67,7 +69,7 @@ def check_depth_unit(source: "ParsedRecording") -> Iterator[Check]:
     origin = source.origin.get("depth_unit_m", "")
     verdict, why = _judged(unit, readings, origin.startswith(CUSTOM))
     if verdict in (Verdict.OK, Verdict.ASSUMED):
-        verdict, why = _contradicted(source, unit, readings) or (verdict, why)
+        verdict, why = _contradicted(source, unit, readings) or _beyond(unit, readings) or (verdict, why)
     says = f"{unit:g} m a count, from {origin}{_scene(unit, readings)}{why}"
     if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL):
         says += f"; write 'depth_unit_m' into {source.write_to}"
@@ -78,11 +80,25 @@ def check_depth_unit(source: "ParsedRecording") -> Iterator[Check]:
 
 def _scene(unit: float, readings: _Readings) -> str:
     """The scene in numbers."""
-    inside = np.mean((readings.counts * unit > _SENSED_M[0]) & (readings.counts * unit < _SENSED_M[1]))
+    inside = _sensed(unit, readings)
     step = f", in steps of {1000 * unit * readings.step:.3g} mm" if readings.step else ""
     return (f": a median of {readings.median:g} counts is {unit * readings.median:.3g} m, nine tenths lie from "
             f"{unit * readings.low:.3g} to {unit * readings.high:.3g} m, {inside:.0%} within "
             f"{_SENSED_M[0]} to {_SENSED_M[1]:g} m{step}")  # fmt: skip
+
+
+def _sensed(unit: float, readings: _Readings) -> float:
+    """The share of the readings that depth cameras measure."""
+    return float(np.mean((readings.counts * unit > _SENSED_M[0]) & (readings.counts * unit < _SENSED_M[1])))
+
+
+def _beyond(unit: float, readings: _Readings) -> tuple[Verdict, str] | None:
+    """Where many readings are nearer or farther than depth cameras measure, whatever the unit's origin."""
+    if _sensed(unit, readings) >= _MOST:
+        return None
+    return Verdict.DOUBTFUL, (
+        ": either the unit is another, or readings stand for none, as where a sensor is blinded, and should be 0"
+    )
 
 
 def _judged(unit: float, readings: _Readings, custom: bool) -> tuple[Verdict, str]:

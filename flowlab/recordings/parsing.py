@@ -15,12 +15,12 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
 from flowlab.recordings.checking import check_recording
 from flowlab.recordings.clock import put_on_one_clock
-from flowlab.recordings.content import without_saturated
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
 from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
 from flowlab.recordings.poses import ABOUT, load_poses, most_apart_s
 from flowlab.recordings.sample_files import load_samples
+from flowlab.recordings.saturation import without_saturated
 from flowlab.recordings.stamps import UnclearStamps
 from flowlab.recordings.sync import last_sample, nearest_sample
 from flowlab.recordings.verdicts import Check, Verdict
