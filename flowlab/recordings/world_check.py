@@ -1,6 +1,6 @@
 """Whether the pose of the camera can be what it is said to be: a table is level, and is seen from above."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,12 +21,27 @@ _BASELINE_M = (0.3, 1.0)
 """Likewise, of how far the depth camera is from the color camera."""
 _PLANE_SHARE = 0.3
 """A plane that so many of the points lie on is one of the scene."""
+_SURE_SHARE = 0.4
+"""One with so many is surely one, and no fit to things in between."""
 _LEVEL_DEG = 8.0
 """A table is level to within this."""
 _TILTED_DEG = 20.0
 """A plane that is tilted by more against every axis of the world is neither a table nor a wall."""
 _TRIES = 150
 _OPENGL = np.diag([1.0, -1, -1, 1])
+_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_OTHERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "the inverse, world to camera": inverse,
+    "in OpenGL's axes (y up, z backward)": lambda T: T @ _OPENGL,
+    "the inverse, in OpenGL's axes": lambda T: inverse(T) @ _OPENGL,
+    "the inverse of one in OpenGL's axes": lambda T: inverse(_OPENGL @ T),
+    "that of a body (x forward, y left, z up)": lambda T: T @ _BODY,
+    "the inverse of a body's (x forward, y left, z up)": lambda T: inverse(T) @ _BODY,
+}
+"""What ``T_world_cam`` would be if it were meant otherwise."""
+_UNITS = {"centimeters": 100.0, "millimeters": 1000.0}
+_NEAR_M = (0.2, 5.0)
+"""A camera is this far from the world's origin in the unit that is meant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +76,9 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
     far = float(np.linalg.norm(T[:3, 3]))
     if far > _FAR_M[0] and poses is None:
         verdict = Verdict.REFUSED if far > _FAR_M[1] else Verdict.DOUBTFUL
-        unit = ", as if in millimeters" if far > _FAR_M[1] else ""
-        says = (
-            f"{stands}: {far:.4g} m from the world's origin{unit}; write 'T_world_cam' in {source.write_to} in meters"
-        )
+        units = [unit for unit, n in _UNITS.items() if _NEAR_M[0] < far / n < _NEAR_M[1]]
+        says = (f"{stands}: {far:.4g} m from the world's origin{', as if in ' if units else ''}{' or '.join(units)}; "
+                f"write 'T_world_cam' in {source.write_to} in meters")  # fmt: skip
         yield Check("world", verdict, says)
         return
     plane = _dominant_plane(_cloud(source))
@@ -96,31 +110,45 @@ def _judged(T: np.ndarray, plane: _Plane | None, stands: str, write_to: str) -> 
     """Whether the plane is a table that is seen from above, and whether it is one only by another reading of T."""
     if plane is None:
         return Check("world", Verdict.ASSUMED, f"{stands}; no plane in the cloud tells whether that is so")
-    seen = f"the plane with {plane.share:.0%} of the points, {plane.distance_m:.2f} m from the camera,"
-    others = {
-        "the inverse, world to camera": inverse(T),
-        "in OpenGL's axes (y up, z backward)": T @ _OPENGL,
-        "the inverse, in OpenGL's axes": inverse(T) @ _OPENGL,
-        "the inverse of one in OpenGL's axes": inverse(_OPENGL @ T),
-    }
-    fit = {how: _tilt(other, plane) for how, other in others.items()}
-    tilt, axis = _tilt(T, plane), _off_axes(T, plane)
-    better = [how for how, off in fit.items() if off < _LEVEL_DEG]
-    if tilt < _LEVEL_DEG:
-        height = T[2, 3] - plane.distance_m * float(T[2, :3] @ plane.normal)
-        says = f"{stands}; {seen} is level and seen from above, at the height {height:.2f} m"
-        same = [how for how in better if not np.allclose(others[how], T, atol=0.02)]
-        if same:
-            return Check("world", Verdict.ASSUMED, f"{says}; it would be so as {same[0]}, too")
-        return Check("world", Verdict.OK, says)
-    how = f"{seen} is tilted by {tilt:.0f} degrees against the world's xy-plane"
-    if better and (axis > _LEVEL_DEG or tilt > 180 - _LEVEL_DEG):
-        says = (f"{stands}; {how}, and level if T_world_cam were {better[0]}; it must map coordinates of the camera "
-                f"(x right, y down, z forward) to the world's (z up): correct it in {write_to}")  # fmt: skip
-        return Check("world", Verdict.REFUSED if axis > _TILTED_DEG or tilt > 90 else Verdict.DOUBTFUL, says)
-    if axis < _LEVEL_DEG and tilt < 180 - _LEVEL_DEG:
-        return Check("world", Verdict.ASSUMED, f"{stands}; {how}, so it may be a wall, or the world has another up")
-    return Check("world", Verdict.ASSUMED, f"{stands}; {how}: look whether that is so")
+    stands = f"{stands}; the plane with {plane.share:.0%} of the points, {plane.distance_m:.2f} m from the camera,"
+    better = [(how, other) for how, read in _OTHERS.items() if _tilt(other := read(T), plane) < _LEVEL_DEG]
+    if _tilt(T, plane) >= _LEVEL_DEG:
+        return _tilted(T, plane, stands, [how for how, _ in better], write_to)
+    height = T[2, 3] - plane.distance_m * float(T[2, :3] @ plane.normal)
+    says = f"{stands} is level and seen from above, at the height {height:.2f} m"
+    same = [how for how, other in better if not np.allclose(other, T, atol=0.02)]
+    if same:
+        return Check("world", Verdict.ASSUMED, f"{says}; it would be so as {same[0]}, too")
+    return Check("world", Verdict.OK, says)
+
+
+def _tilted(T: np.ndarray, plane: _Plane, stands: str, better: list[str], write_to: str) -> Check:
+    """What is said of a plane that is no table as T says: a wall, or the pose is meant otherwise, or wrong."""
+    tilt, axis, below = _tilt(T, plane), _off_axes(T, plane), _tilt(T, plane) > 180 - _LEVEL_DEG
+    says = f"{stands} is tilted by {tilt:.0f} degrees against the world's xy-plane"
+    if axis < _LEVEL_DEG and not below:
+        return Check("world", Verdict.ASSUMED, f"{says}, so it may be a wall, or the world has another up")
+    if below:
+        says = f"{stands} is level, but seen from below, as if the world's z axis pointed down"
+    sure = below or axis > _TILTED_DEG or tilt > 90
+    if better:
+        says += f", and seen from above if T_world_cam were {better[0]}"
+    elif sure and plane.share >= _SURE_SHARE:
+        says += _rolled(T, plane)
+    else:
+        return Check("world", Verdict.ASSUMED, f"{says}: look whether that is so")
+    says += "; it must map coordinates of the camera (x right, y down, z forward) to the world's (z up): correct it in "
+    return Check("world", Verdict.REFUSED if better and sure else Verdict.DOUBTFUL, f"{says}{write_to}")
+
+
+def _rolled(T: np.ndarray, plane: _Plane) -> str:
+    """Whether the plane would be level if the camera were turned about where it looks."""
+    for angle in (180, 90, -90):
+        c, s = round(np.cos(np.radians(angle))), round(np.sin(np.radians(angle)))
+        turned = T @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        if _tilt(turned, plane) < _LEVEL_DEG:
+            return f", and level if the camera were turned by {angle} degrees about where it looks"
+    return ", so it is neither a table nor a wall"
 
 
 def _tilt(T: np.ndarray, plane: _Plane) -> float:

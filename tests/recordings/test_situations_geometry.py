@@ -22,6 +22,7 @@ SIZE = (160, 120)
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
 GIVEN: dict[str, Any] = {"fx": 150.0, "fy": 150.0, "cx": 79.5, "cy": 59.5}
 POSE = looking((0.3, -0.9, 0.7))
+BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 ARM = Box((-0.3, 0.0, 0.25), (0.25, 0.2, 0.5), (220, 210, 60))
 
 
@@ -177,9 +178,12 @@ def test_depth_that_was_never_aligned_is_refused(tmp_path: Path, capsys: Capture
 @pytest.mark.parametrize(
     ("T", "words"),
     [
-        (np.linalg.inv(POSE), "level if T_world_cam were the inverse, world to camera"),
-        (POSE @ np.diag([1.0, -1, -1, 1]), "level if T_world_cam were in OpenGL's axes"),
+        (np.linalg.inv(POSE), "from above if T_world_cam were the inverse, world to camera"),
+        (POSE @ np.diag([1.0, -1, -1, 1]), "from above if T_world_cam were in OpenGL's axes"),
+        (POSE @ BODY.T, "from above if T_world_cam were that of a body (x forward, y left, z up)"),
+        (np.linalg.inv(POSE @ BODY.T), "from above if T_world_cam were the inverse of a body's"),
         (np.block([[POSE[:3, :3], 1000 * POSE[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]]), "in millimeters"),
+        (np.block([[POSE[:3, :3], 100 * POSE[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]]), "in centimeters;"),
     ],
 )
 def test_a_pose_in_other_terms_is_refused(
@@ -188,6 +192,34 @@ def test_a_pose_in_other_terms_is_refused(
     code, found, problem = verdicts(capsys, put(tmp_path / "r", still, T_world_cam=T.tolist()))
     assert (code, found["world"][0]) == (3, "refused"), found["world"]
     assert words in problem
+
+
+@pytest.mark.parametrize(
+    ("turn", "verdict", "words"),
+    [
+        ((0, 0, np.pi), "doubtful", "level if the camera were turned by 180 degrees"),
+        ((0, 0, -np.pi / 2), "doubtful", "level if the camera were turned by 90 degrees"),
+        ((0.7, 0, 0), "doubtful", "neither a table nor a wall"),
+        ((0.2, 0, 0), "assumed", "look whether that is so"),
+        ((0.05, 0, 0), "ok", "level"),
+    ],
+)
+def test_a_pose_that_tilts_the_scene_is_doubtful(
+    still: list[tuple[np.ndarray, np.ndarray]], tmp_path: Path, capsys: Capture, turn: Any, verdict: str, words: str
+) -> None:
+    T = POSE.copy()
+    T[:3, :3] = T[:3, :3] @ cv2.Rodrigues(np.array(turn, float))[0]
+    code, found, _ = verdicts(capsys, put(tmp_path / "r", still[:2], T_world_cam=T.tolist()))
+    assert (code, found["world"][0]) == (0, verdict), found["world"]
+    assert words in found["world"][1]
+
+
+def test_a_wall_is_no_tilted_table(tmp_path: Path, capsys: Capture) -> None:
+    pose = looking((0.0, -1.5, 0.3), (0.0, 0.0, 0.3))
+    frames = [film(SCENE, K, SIZE, pose, seed=t) for t in range(2)]
+    code, found, _ = verdicts(capsys, put(tmp_path / "r", frames, T_world_cam=pose.tolist()))
+    assert (code, found["world"][0]) == (0, "assumed"), found["world"]
+    assert "may be a wall" in found["world"][1]
 
 
 def test_a_moving_camera_is_noticed(tmp_path: Path, capsys: Capture) -> None:
