@@ -73,6 +73,16 @@ def decode_color(content: bytes) -> UInt8[np.ndarray, "H W 3"]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
+def exif_turns(file: Path) -> bool:
+    """Whether a note in a color picture says to turn it (EXIF), which :func:`decode_color` ignores."""
+    try:
+        content = read_bytes(file, MAX_PICTURE_BYTES)
+        stored, shown = (_decode(content, cv2.IMREAD_COLOR | how) for how in (cv2.IMREAD_IGNORE_ORIENTATION, 0))
+    except (DataError, BadImage):  # of a stream without files, or of one that is bad
+        return False
+    return stored.shape != shown.shape or bool((stored != shown).any())
+
+
 def decode_depth(content: bytes) -> Num[np.ndarray, "H W"]:
     """Counts (H, W) of an encoded depth picture."""
     return check_depth(_decode(content, cv2.IMREAD_UNCHANGED))

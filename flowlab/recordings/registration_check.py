@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from flowlab.recordings.image_files import exif_turns
 from flowlab.recordings.lens import undistorted_rays
 from flowlab.recordings.picture_samples import PictureSample
 from flowlab.recordings.verdicts import Check, Verdict
@@ -31,8 +32,13 @@ _CLARITY = (4.0, 5.0)
 """The best place is above all places by so many standard deviations, for a doubt and for a refusal."""
 _GAIN = (0.12, 0.35)
 """Likewise, it is this much better than where depth lies."""
+_LIES = 0.35
+"""Where edges of depth lie on those of color, these are as strong, in standard deviations of the picture."""
+_CLEAR, _CLEAR_SHARE = 40.0, 0.03
+"""A gradient of a smoothed picture, by Sobel, is no noise beyond this; so many pixels have one, or all is dim."""
 _SHARE = (0.012, 0.03)
 """Likewise, the worst corner is this far off, of the picture's width."""
+_SEVERITY = list(Verdict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +54,15 @@ class Misalignment:
     """How many standard deviations the best place is above all places."""
     gain: float
     """How much better the best place is than where depth lies, 0 to 1 and more."""
-    edges: int
-    """Pixels of depth edges in a frame."""
+    here: float
+    """How strong edges of color are where those of depth lie, in standard deviations of all."""
+    textured: bool
+    """Whether color has edges that are no noise."""
+
+    @property
+    def lies_nowhere(self) -> bool:
+        """Whether edges of depth lie on none of color's, though there are some."""
+        return self.textured and self.here < _LIES
 
 
 def estimate_misalignment(samples: Sequence[PictureSample]) -> Misalignment | None:
@@ -75,7 +88,8 @@ def estimate_misalignment(samples: Sequence[PictureSample]) -> Misalignment | No
         float(off / width),
         (best - mean) / spread if spread > 0 else 0.0,
         (best - here) / (best - mean) if best > mean else 0.0,
-        int(np.mean([np.count_nonzero(d) for d, _ in pairs])),
+        here / max(float(np.mean([c.std() for _, c in pairs])), 1e-6),
+        bool(np.mean([_clear_share(s.gray) for s in some]) >= _CLEAR_SHARE),
     )
 
 
@@ -114,6 +128,12 @@ def _color_edges(gray: np.ndarray) -> Float32[np.ndarray, "2 H W"]:
     return (found - found.mean((1, 2), keepdims=True)).astype(np.float32)
 
 
+def _clear_share(gray: np.ndarray) -> float:
+    """The share of the pixels at edges that are no noise."""
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.5)
+    return float((np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) > _CLEAR).mean())
+
+
 def _scores(pairs: Sequence[tuple[np.ndarray, np.ndarray]], scale: float, reach: int) -> np.ndarray:
     """Mean strength of color edges under depth edges, for every shift (dy, dx) within reach."""
     total = np.zeros((2 * reach + 1, 2 * reach + 1))
@@ -136,37 +156,55 @@ def _scores(pairs: Sequence[tuple[np.ndarray, np.ndarray]], scale: float, reach:
 def check_registration(source: "ParsedRecording") -> Check:
     """Whether depth lies on color, by what is said of it and by the pictures."""
     how, stated = _how(source)
-    samples = source.frame_check.samples
+    samples, seen, turned = source.frame_check.samples, source.frame_check, _turned(source)
     if how is None:
         return Check("registration", Verdict.DOUBTFUL, "depth is seen from a camera of its own, and not registered yet")
     if source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None:
         samples = tuple(_registered(source))
-    elif source.frame_check.color_size != source.frame_check.depth_size:
-        return Check("registration", Verdict.REFUSED, f"{how}, but has another size than color; give "
-                     f"'depth_intrinsics' and 'T_color_depth' in {source.write_to}")  # fmt: skip
+    elif seen.color_size != seen.depth_size:
+        (w, h), (width, height) = seen.depth_size, seen.color_size
+        return Check("registration", Verdict.REFUSED, f"depth has pictures of {w}x{h}, color of {width}x{height}, so "
+                     f"it is not registered to color{turned}; give 'depth_intrinsics' and 'T_color_depth' in "
+                     f"{source.write_to}")  # fmt: skip
     found = estimate_misalignment(samples)
-    if found is None or found.clarity < _CLARITY[0]:
-        why = "too few edges in the pictures to tell" if found is None else (
-            f"edges of depth fit edges of color nowhere well enough to tell (clarity {found.clarity:.1f})")  # fmt: skip
-        return Check("registration", Verdict.OK if stated else Verdict.ASSUMED, f"{how}; {why}")
-    where = (f"edges of depth fit those of color best when moved by ({found.shift_px[0]:g}, {found.shift_px[1]:g}) px "
-             f"and sized by {found.scale:.2f} (gain {found.gain:.2f}, clarity {found.clarity:.1f})")  # fmt: skip
-    verdict = _verdict(found)
-    if verdict is Verdict.OK:
-        return Check("registration", verdict, f"{how}, and the pictures agree: edges of depth lie on those of color")
-    advice = (f"give 'depth_intrinsics' and 'T_color_depth' in {source.write_to}, or record depth that is aligned to "
-              "color")  # fmt: skip
-    if source.metadata.T_color_depth is not None:
-        advice = f"correct 'depth_intrinsics' or 'T_color_depth' in {source.write_to}"
-    return Check("registration", verdict, f"{how}, but {where}; {advice}")
+    verdict, says = _judged(found, stated)
+    if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL) or (turned and verdict is not Verdict.OK):
+        advice = "give 'depth_intrinsics' and 'T_color_depth', or record depth that is aligned to color: see"
+        if source.metadata.T_color_depth is not None:
+            advice = "correct 'depth_intrinsics' or 'T_color_depth' in"
+        elif turned:
+            advice = "turn the pictures themselves, as depth is, and remove that note; intrinsics are those in"
+        return Check("registration", max(verdict, Verdict.DOUBTFUL, key=_SEVERITY.index),
+                     f"{how}{says}{turned}; {advice} {source.write_to}")  # fmt: skip
+    return Check("registration", verdict, f"{how}{says}{turned and f'{turned}, and is taken as it is stored'}")
 
 
-def _verdict(found: Misalignment) -> Verdict:
-    """Depth that is off by little, or not clearly, is let pass."""
+def _judged(found: Misalignment | None, stated: bool) -> tuple[Verdict, str]:
+    """What the pictures say: depth that is off by little, or not clearly, is let pass."""
+    untold = Verdict.OK if stated else Verdict.ASSUMED
+    if found is None:
+        return untold, "; too few edges in the pictures to tell"
+    where = (f"moved by ({found.shift_px[0]:g}, {found.shift_px[1]:g}) px and sized by {found.scale:.2f} "
+             f"(gain {found.gain:.2f}, clarity {found.clarity:.1f})")  # fmt: skip
     for k, verdict in ((1, Verdict.REFUSED), (0, Verdict.DOUBTFUL)):
-        if found.gain > _GAIN[k] and found.share > _SHARE[k] and found.clarity > _CLARITY[k]:
-            return verdict
-    return Verdict.OK
+        elsewhere = found.gain > _GAIN[k] and found.share > _SHARE[k] and found.clarity > _CLARITY[k]
+        if elsewhere and (found.clarity > _CLARITY[1] or found.lies_nowhere):
+            return verdict, f", but edges of depth fit those of color best when {where}"
+    if found.clarity >= _CLARITY[0] and (found.gain <= _GAIN[0] or found.share <= _SHARE[0]):
+        return Verdict.OK, ", and the pictures agree: edges of depth lie on those of color"
+    if found.lies_nowhere:
+        return Verdict.DOUBTFUL, (f", but edges of depth lie on none of color's ({found.here:.2f} standard deviations "
+                                  f"above the mean, expected {_LIES} and more), and fit nowhere else: it may be "
+                                  "turned, mirrored, or of another camera or time")  # fmt: skip
+    return untold, f"; edges of depth fit edges of color nowhere well enough to tell (clarity {found.clarity:.1f})"
+
+
+def _turned(source: "ParsedRecording") -> str:
+    """What files of color say of how to turn them, which flowlab does not do; empty where they say nothing."""
+    name = source.streams.color.names[0]
+    if source.path.is_dir() and exif_turns(source.path / name):
+        return f"; {name} has a note that it is to be turned when it is shown (EXIF orientation)"
+    return ""
 
 
 def _how(source: "ParsedRecording") -> tuple[str | None, bool]:

@@ -144,3 +144,56 @@ def test_surfaces_are_no_limits(still: Frames, tmp_path: Path, capsys: Capture, 
     assert said(capsys, tmp_path / "table", "saturated depth", frames)[0] == "ok"
     rough = [(rgb, 20 / np.rint(20 / depth)) for rgb, depth in still[:6]]
     assert said(capsys, tmp_path / "rough", "saturated depth", rough)[0] == "ok"
+
+
+# --- depth that is not seen from the color camera -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d[::-1, ::-1],
+        lambda d: d[:, ::-1],
+        lambda d: np.where(d > 0, np.roll(d[::-1], 9, 1), 0),
+        lambda d: np.roll(d, (20, 30), (0, 1)),
+    ],
+    ids=["upside-down", "mirrored", "flipped", "far-away"],
+)
+def test_depth_that_fits_nowhere_is_doubtful(
+    still: Frames, tmp_path: Path, capsys: Capture, change: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    verdict, says = said(capsys, tmp_path / "r", "registration", [(rgb, change(depth)) for rgb, depth in still[:4]])
+    assert verdict in ("doubtful", "refused"), says
+
+
+def test_pictures_without_edges_tell_nothing_of_registration(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    rng = np.random.default_rng(0)
+    for name, level, noise in (("white", 200, 3), ("gray", 128, 12)):
+        plain = [(rng.normal(level, noise, rgb.shape).clip(0, 255).astype(np.uint8), depth) for rgb, depth in still[:4]]
+        assert said(capsys, tmp_path / name, "registration", plain)[0] == "assumed"
+    for name, eye, at in (("wall", (0.0, -1.5, 0.3), (0.0, 0, 0.3)), ("top", (0.0, -0.2, 1.3), (0.0, 0, 0))):
+        frames = filmed(lambda t, eye=eye, at=at: looking(eye, at), count=4)  # type: ignore[misc]
+        assert said(capsys, tmp_path / name, "registration", frames)[0] in ("ok", "assumed")
+
+
+def test_pictures_that_are_to_be_turned_are_told(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    """EXIF's orientation 3: upside down."""
+    note = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0"
+    for name, turn, verdict in (("turned", True, "doubtful"), ("as-stored", False, "ok")):
+        folder = put(tmp_path / name, still[:4], intrinsics=GIVEN, T_world_cam=None)
+        for t, (rgb, _) in enumerate(still[:4]):
+            (folder / f"color/{t:04d}.png").unlink()
+            stored = np.ascontiguousarray(rgb[::-1, ::-1] if turn else rgb)[..., ::-1]
+            jpeg = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+            content = jpeg[:2] + b"\xff\xe1" + (len(note) + 2).to_bytes(2, "big") + note + jpeg[2:]
+            (folder / f"color/{t:04d}.jpg").write_bytes(content)
+        found = verdicts(capsys, folder)[1]["registration"]
+        assert found[0] == verdict, found
+        assert "EXIF orientation" in found[1]
+
+
+def test_depth_of_another_size_is_said_to_be(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    small = [(rgb, depth[::2, ::2]) for rgb, depth in still[:2]]
+    verdict, says = said(capsys, tmp_path / "r", "registration", small)
+    assert verdict == "refused"
+    assert says.startswith("depth has pictures of 48x36, color of 96x72, so it is not registered")
