@@ -18,6 +18,30 @@ _UNEQUAL = (1.15, 2.5)
 """Where fx and fy differ by these factors they are doubtful, and refused."""
 _VIEW_DEG = ((25.0, 125.0), (6.0, 165.0))
 """Fields of view outside of these are doubtful, and refused."""
+_ALIKE = 1.05
+"""Focal lengths that are one lens's agree to this factor."""
+_MIDDLE = 0.08
+"""A principal point this near the corner, of width and height, counts from the middle."""
+_NEAR = 0.04
+"""A principal point this far from the middle of pictures is theirs."""
+_FACTORS = (1 / 8, 1 / 6, 1 / 5, 1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 5 / 2, 3, 4, 5, 6, 20 / 3, 8)
+"""By these pictures are shrunk, and enlarged."""
+_MEANT = {
+    (True, True, False): "are not in pixels but shares of the picture",
+    (True, False, False): "are not in pixels but shares of the picture",
+    (True, True, True): "are not in pixels from the picture's corner but shares of it from its middle",
+    (False, True, False): "are not in pixels, as if in millimeters",
+    (False, True, True): "are not in pixels from the picture's corner, as if in millimeters from its middle",
+    (False, False, True): "count from the picture's middle, not from its corner",
+}
+"""What is said of numbers by whether they are shares, whether focal lengths are none in pixels, and the middle."""
+_SWAPS = {
+    "the focal lengths and the principal point": {"fx": "cx", "fy": "cy", "cx": "fx", "cy": "fy"},
+    "fx and cx": {"fx": "cx", "cx": "fx"},
+    "fy and cy": {"fy": "cy", "cy": "fy"},
+    "cx and cy": {"cx": "cy", "cy": "cx"},
+    "fy and cx": {"fy": "cx", "cx": "fy"},
+}
 _SIZES = (
     (1920, 1080), (1280, 720), (960, 540), (848, 480), (640, 480), (640, 360), (512, 424), (480, 270), (424, 240),
     (320, 240), (1280, 800), (2048, 1536), (1920, 1440), (1440, 1080), (1280, 960), (1024, 768), (2560, 1440),
@@ -53,53 +77,94 @@ def _faults(about: str, given: Intrinsics, size: _Size, write_to: str) -> Iterat
     if of != size:
         yield Verdict.REFUSED, _other_size(about, given, of, size, write_to)
         return
-    for fault in (_normalized(about, given, size), _off_axis(about, given, size), _swapped(about, given)):
+    for fault in (_not_in_pixels(given, size), _off_axis(given, size)):
         if fault is not None:
-            yield fault[0], f"{fault[1]}; write into {write_to} those of these pictures: '{about}: {fault[2]}'"
+            yield fault[0], f"{fault[1]} write into {write_to} those of these pictures: '{about}: {fault[2]}'"
             return
-    width, height = _view_deg(given, size)
-    if given.lens is not Lens.FISHEYE:
-        for verdict, (low, high) in zip((Verdict.REFUSED, Verdict.DOUBTFUL), _VIEW_DEG[::-1], strict=True):
-            if not (low < width < high and low < height < high):
-                yield verdict, (f"fx {given.fx:g} and fy {given.fy:g} px make a field of view of {width:.0f} x "
-                                f"{height:.0f} degrees; correct '{about}' in {write_to}")  # fmt: skip
-                return
+    for fault in (_view(given, size, Verdict.REFUSED), _unequal(given), _view(given, size, Verdict.DOUBTFUL)):
+        if fault is not None:
+            yield fault[0], f"{fault[1]}; correct '{about}' in {write_to}: {fault[2]}"
+            return
 
 
 _Fault = tuple[Verdict, str, str]
 
 
-def _normalized(about: str, given: Intrinsics, size: _Size) -> _Fault | None:
-    """Numbers that are shares of the picture, not pixels."""
-    if max(given.fx, given.fy) >= min(_NORMALIZED, size[0] / 4) or not (abs(given.cx) < 2 and abs(given.cy) < 2):
+def _not_in_pixels(given: Intrinsics, size: _Size) -> _Fault | None:
+    """Numbers that are shares of the picture, or count from its middle, not pixels from its corner."""
+    f_shares = max(given.fx, given.fy) < min(_NORMALIZED, size[0] / 4)
+    c_shares = 0.2 < given.cx < 1 and 0.2 < given.cy < 1
+    middle = not c_shares and max(abs(given.cx) / size[0], abs(given.cy) / size[1]) < _MIDDLE
+    if not (f_shares or c_shares or middle):
         return None
-    pixels = _scaled(given, (1, 1), size, center=0.0)
-    says = f"fx {given.fx:g} and cx {given.cx:g} are not in pixels but shares of the picture"
-    return Verdict.REFUSED, says, pixels.to_yaml()
+    focal = _focal_px(given, size) if f_shares else (given.fx, given.fy)
+    center = _center_px(given, size, c_shares or (middle and f_shares), middle)
+    parts = [f"fx {given.fx:g} and fy {given.fy:g}"] * f_shares
+    parts += [f"cx {given.cx:g} and cy {given.cy:g}"] * (c_shares or middle)
+    says = f"{', '.join(parts)} {_MEANT[c_shares or (f_shares and focal is not None), f_shares, middle]}"
+    f_px = "fx: ..., fy: ..." if focal is None else f"fx: {focal[0]:.6g}, fy: {focal[1]:.6g}"
+    return Verdict.REFUSED, f"{says};", f"{{{f_px}, cx: {center[0]:.6g}, cy: {center[1]:.6g}}}"
 
 
-def _off_axis(about: str, given: Intrinsics, size: _Size) -> _Fault | None:
+def _focal_px(given: Intrinsics, size: _Size) -> tuple[float, float] | None:
+    """Focal lengths in pixels of shares of both sides, of their halves or of one side; None where none is likely."""
+    (w, h) = size
+    options = [(given.fx * x, given.fy * y) for x, y in ((w, h), (w / 2, h / 2), (w, w), (h, h), (w / 2, w / 2))]
+    likely = [o for o in options if max(o) / min(o) < _ALIKE and _within(o, size, _VIEW_DEG[0])]
+    return likely[0] if likely else None
+
+
+def _center_px(given: Intrinsics, size: _Size, shares: bool, middle: bool) -> tuple[float, float]:
+    """The principal point in pixels of one in shares, of both sides or of one, or that counts from the middle."""
+    (w, h), (cx, cy) = size, (given.cx, given.cy)
+    if middle:
+        return (cx * w if shares else cx) + (w - 1) / 2, (cy * h if shares else cy) + (h - 1) / 2
+    if shares:
+        options = [(cx * x - 0.5, cy * y - 0.5) for x, y in ((w, h), (w, w), (h, h))]
+        return min(options, key=lambda c: abs(c[0] / w - 0.5) + abs(c[1] / h - 0.5))
+    return cx, cy
+
+
+def _off_axis(given: Intrinsics, size: _Size) -> _Fault | None:
     """A principal point far from the middle, and why that may be."""
     off = max(abs(given.cx / size[0] - 0.5), abs(given.cy / size[1] - 0.5))
     if given.cropped or off <= _OFF_AXIS[0]:
         return None
     says = f"the principal point ({given.cx:g}, {given.cy:g}) is far from the middle of pictures of {size[0]}x{size[1]}"
-    turned = given.model_copy(update={"fx": given.cx, "cx": given.fx, "fy": given.cy, "cy": given.fy})
-    if given.cx > 0 and given.cy > 0 and _is_central(turned, size) and not _UNEQUAL[0] < given.cx / given.cy:
-        return Verdict.REFUSED, f"{says}: the focal lengths and the principal point look swapped", turned.to_yaml()
-    half = given.model_copy(update={"fx": given.cx, "cx": given.fx})
-    if given.cx > 0 and _is_central(half, size) and 1 / _UNEQUAL[0] < given.cx / given.fy < _UNEQUAL[0]:
-        return Verdict.REFUSED, f"{says}: fx and cx look swapped", half.to_yaml()
-    of = min(_SIZES, key=lambda s: abs(given.cx / s[0] - 0.5) + abs(given.cy / s[1] - 0.5))
+    for what, names in _SWAPS.items():
+        values = given.model_dump()
+        turned = given.model_copy(update={to: values[of] for to, of in names.items()})
+        if min(turned.fx, turned.fy) > 0 and _is_usual(turned, size):
+            return Verdict.REFUSED, f"{says}: {what} look swapped;", turned.to_yaml()
     verdict = Verdict.REFUSED if off > _OFF_AXIS[1] else Verdict.DOUBTFUL
-    if of == size or not _is_central(given, of, 0.06):
-        hint = given.model_copy(update={"width": size[0], "height": size[1], "cropped": True})
-        return verdict, f"{says}, as of a part cut out of larger ones ('cropped: true')", hint.to_yaml()
-    says = f"{says}, as of pictures of {of[0]}x{of[1]}"
-    return verdict, says, resized(given, of, size).to_yaml()
+    of = _size_of(given, size)
+    if of is None:
+        says += ", as of a part cut out of larger ones; if they are that, add 'cropped: true', else"
+        return verdict, says, "{fx: ..., fy: ..., cx: ..., cy: ...}"
+    if _same_shape(of, size):
+        verdict = Verdict.REFUSED
+    return verdict, f"{says}, as of pictures of {of[0]}x{of[1]};", resized(given, of, size).to_yaml()
 
 
-def _swapped(about: str, given: Intrinsics) -> _Fault | None:
+def _is_usual(given: Intrinsics, size: _Size) -> bool:
+    """Whether intrinsics are those of a usual camera with pictures of a size."""
+    alike = 1 / _UNEQUAL[0] < given.fx / given.fy < _UNEQUAL[0]
+    return alike and _is_central(given, size, _NEAR) and _within((given.fx, given.fy), size, _VIEW_DEG[0])
+
+
+def _size_of(given: Intrinsics, size: _Size) -> _Size | None:
+    """The size of the pictures that intrinsics are of, by their principal point; None where that does not tell."""
+    usual = [*((round(size[0] * k), round(size[1] * k)) for k in _FACTORS), *_SIZES]
+    near = [of for of in usual if of != size and _is_central(given, of, _NEAR / 2)]
+    if near:
+        return min(near, key=lambda of: (not _same_shape(of, size), abs((given.cx + 0.5) / of[0] - 0.5)))
+    of = (round(2 * given.cx + 1), round(2 * given.cy + 1))
+    x, y = of[0] / size[0], of[1] / size[1]
+    whole = min(x, y) > 0 and abs(x / y - 1) < 2 * _NEAR
+    return of if whole or (abs(min(x, y) - 1) < 2 * _NEAR and max(x, y) > 1) else None
+
+
+def _unequal(given: Intrinsics) -> _Fault | None:
     """Focal lengths that differ too much for one lens."""
     ratio = max(given.fx, given.fy) / min(given.fx, given.fy)
     if ratio <= _UNEQUAL[0]:
@@ -107,7 +172,21 @@ def _swapped(about: str, given: Intrinsics) -> _Fault | None:
     verdict = Verdict.REFUSED if ratio > _UNEQUAL[1] else Verdict.DOUBTFUL
     says = (f"fx {given.fx:g} and fy {given.fy:g} differ by {ratio - 1:.0%}, as if the pictures had been stretched, or "
             "the numbers were of other pictures")  # fmt: skip
-    return verdict, says, "{fx: ..., fy: ..., cx: ..., cy: ...}"
+    return verdict, says, "they are about equal for pictures that are not stretched"
+
+
+def _view(given: Intrinsics, size: _Size, verdict: Verdict) -> _Fault | None:
+    """A field of view that cameras do not have; fisheyes have any."""
+    if given.lens is Lens.FISHEYE or _within((given.fx, given.fy), size, _VIEW_DEG[verdict is Verdict.REFUSED]):
+        return None
+    width, height = _view_deg(given.fx, given.fy, size)
+    says = f"fx {given.fx:g} and fy {given.fy:g} px make a field of view of {width:.0f} x {height:.0f} degrees"
+    return verdict, says, "focal lengths are in pixels of these pictures"
+
+
+def _within(focal: tuple[float, float], size: _Size, limits: tuple[float, float]) -> bool:
+    """Whether both fields of view lie between limits."""
+    return all(limits[0] < view < limits[1] for view in _view_deg(*focal, size))
 
 
 def _is_central(given: Intrinsics, size: _Size, share: float = _OFF_AXIS[0]) -> bool:
@@ -161,15 +240,15 @@ def _scaled(given: Intrinsics, of: _Size, size: tuple[float, float], center: flo
     )
 
 
-def _view_deg(given: Intrinsics, size: _Size) -> tuple[float, float]:
+def _view_deg(fx: float, fy: float, size: _Size) -> tuple[float, float]:
     """Field of view, along both axes, of the ideal picture."""
-    half = np.degrees(np.arctan([size[0] / (2 * given.fx), size[1] / (2 * given.fy)]))
+    half = np.degrees(np.arctan([size[0] / (2 * fx), size[1] / (2 * fy)]))
     return 2 * float(half[0]), 2 * float(half[1])
 
 
 def _as_it_is(about: str, given: Intrinsics, size: _Size) -> Check:
     """What is said of intrinsics that may be right."""
-    width, height = _view_deg(given, size)
+    width, height = _view_deg(given.fx, given.fy, size)
     says = (f"fx {given.fx:.5g}, fy {given.fy:.5g}, a field of view of {width:.0f} x {height:.0f} degrees, the "
             f"principal point at {given.cx / size[0]:.0%} and {given.cy / size[1]:.0%} of the picture; ")  # fmt: skip
     if given.lens is None:
