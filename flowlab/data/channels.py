@@ -17,7 +17,9 @@ _NEAR_M = 0.1
 _MOTION_M = 0.03
 """The gripper has moved when it has moved this far."""
 _FOLLOWS = 0.25
-"""A point moves with the gripper where it moves, and stays as far from it up to this share of the way."""
+"""A point moves with the gripper where it moves, and takes it to where it is up to this share of the way."""
+_BODY = 3
+"""So many points tell how a held thing turns, and so where it takes the gripper."""
 _PROOFS = 3
 """So many motions, and half of those with a track nearby, must have points that move with the gripper."""
 _REACHED_M = 0.02
@@ -108,12 +110,26 @@ def _motions(buffer: ReplayBuffer, episode: EpisodeSlice) -> Iterator[bool]:
         if length < _MOTION_M:
             continue
         then, now = buffer.tracks[last], buffer.tracks[t]
-        before, after = (np.linalg.norm(p - buffer.state[k, :3], axis=1) for p, k in ((then, last), (now, t)))
-        near = buffer.visible[last] & buffer.visible[t] & (before < _NEAR_M)
+        near = np.linalg.norm(then - buffer.state[last, :3], axis=1) < _NEAR_M
+        near &= buffer.visible[last] & buffer.visible[t]
         moves = near & (np.linalg.norm(now - then, axis=1) > _FOLLOWS * length)
-        if near.any():  # held things turn with the gripper, so that their distance stays, not their place beside it
-            yield bool(moves.any() and np.median(np.abs(after - before)[moves]) < _FOLLOWS * length)
+        if near.any():
+            yield bool(_off_way(then[moves], now[moves], buffer.state[last, :3], way) < _FOLLOWS * length)
         last = t
+
+
+def _off_way(then: np.ndarray, now: np.ndarray, gripper: np.ndarray, way: np.ndarray) -> float:
+    """How far from its way points take a gripper with them [m]: all as they move, or as a body that turns."""
+    if not len(then):
+        return float("inf")
+    alike = float(np.median(np.linalg.norm(now - then - way, axis=1)))
+    if len(then) < _BODY:  # they turn about an axis that is not known, but stay as far away
+        before, after = np.linalg.norm(then - gripper, axis=1), np.linalg.norm(now - gripper - way, axis=1)
+        return alike if len(then) == 1 else min(alike, float(np.abs(after - before).max()))
+    middle, moved = then.mean(0), now.mean(0)
+    u, _, v = np.linalg.svd((then - middle).T @ (now - moved))
+    R = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ v))]) @ v).T
+    return min(alike, float(np.linalg.norm(R @ (gripper - middle) + moved - gripper - way)))
 
 
 def _actions_are_positions(buffer: ReplayBuffer) -> bool:

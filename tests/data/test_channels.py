@@ -123,3 +123,22 @@ def test_numbers_near_points_that_do_not_move_with_them_are_no_gripper(tmp_path:
         return replace(e, state=np.concatenate([start + way, e.state[:, 3:]], 1).astype(np.float32))
 
     assert channels_of(tmp_path / "d", [near(k) for k in range(3)]).gripper is None
+
+
+@pytest.mark.parametrize(
+    ("degrees", "scale", "seen"),
+    [(0, 1.0, True), (5, 1.0, True), (30, 1.0, False), (60, 1.0, False), (0, 1.5, False), (0, 0.6, False)],
+)
+def test_a_gripper_goes_the_way_on_which_points_take_it(
+    tmp_path: Path, degrees: float, scale: float, seen: bool
+) -> None:
+    """Of a state in a frame that is turned, or in other units, the distance to points alone would not tell."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = scale * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+    def turned(e: Episode) -> Episode:
+        middle = e.state[:, :3].mean(0)
+        return replace(e, state=np.c_[(e.state[:, :3] - middle) @ turn.T + middle, e.state[:, 3:]].astype(np.float32))
+
+    found = channels_of(tmp_path / "d", [turned(recorded(k)) for k in range(3)])
+    assert found.gripper == (FIRST if seen else None)
