@@ -1,6 +1,7 @@
 """Recordings of real robots as demonstrations: found, and opened."""
 
 import logging
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from flowlab.recordings.parsing import AlignedSamples, ParsedRecording, Recordin
 from flowlab.recordings.sync import find_gaps
 from flowlab.recordings.verdicts import CHECKS, raise_refused
 from flowlab.records import Frame
+from flowlab.text import shown
 
 _LOG = logging.getLogger(__name__)
 __all__ = [
@@ -100,6 +102,10 @@ def _below(path: Path, readers: tuple[Reader, ...], above: frozenset[Path] = fro
         yield path
     elif says := foreign_format(path):
         _LOG.warning("flowlab: %s: %s; it is left out", path, says)
+    elif path.is_symlink() and not path.exists():
+        _LOG.warning(
+            "flowlab: %s: is a link that leads nowhere (to %s); it is left out", path, shown(os.readlink(path))
+        )
     elif path.is_dir() and (real := path.resolve()) not in above:
         for name in entries(path):
             yield from _below(path / name, readers, above | {real})
