@@ -38,20 +38,25 @@ def without_saturated(streams: Streams) -> Streams:
     pictures = [picture for pair in pairs for picture in pair]
     limits = _limits(pairs)
     masked = replace(depth, read=partial(_read_masked, depth.read, limits))
-    shares = {v: float(np.mean([(p == v).mean() for p in pictures])) for v in (*limits, *_types_limits(pictures))}
-    seen = {value: share for value, share in shares.items() if share > 0}
-    if not seen:
-        check = Check("saturated depth", Verdict.OK, "no reading is that of a limit")
-    else:
-        which = ", ".join(f"{v:g} counts ({s:.1%} of the pixels)" for v, s in sorted(seen.items()))
-        check = Check("saturated depth", Verdict.ASSUMED, f"{which} are taken as no reading: each is steady where "
-                      "other readings vary, or far beyond them, as where depth is cut off")  # fmt: skip
+    says = [
+        f"{value:g} counts are taken as no reading: {_place(pictures, value)}, in {share:.1%} of the pixels"
+        for value in sorted({*limits, *_types_limits(pictures)})
+        if (share := float(np.mean([(p == value).mean() for p in pictures])))
+    ]
+    verdict = Verdict.ASSUMED if says else Verdict.OK
+    check = Check("saturated depth", verdict, "; ".join(says) or "no reading is that of a limit")
     return replace(streams, depth=masked, checks=(*streams.checks, check))
+
+
+def _place(pictures: Sequence[np.ndarray], value: float) -> str:
+    """Where a limit is among the readings."""
+    readings = np.concatenate([p[np.isfinite(p) & (p > 0)] for p in pictures])
+    return "the greatest" if readings.max() == value else "the least" if readings.min() == value else "always the same"
 
 
 def _pairs(depth: ImageStream) -> list[list[np.ndarray]]:
     """Pictures one right after the other, thinned, at some places of the recording; alone where the other is bad."""
-    starts = np.unique(np.linspace(0, max(len(depth) - 2, 0), _PAIRS).astype(int)) if len(depth) else []
+    starts = np.unique(np.linspace(0, max(len(depth) - 2, 0), _PAIRS).astype(int))
     return [[p for i in (at, at + 1) if (p := _thinned(depth, int(i))) is not None] for at in starts]
 
 

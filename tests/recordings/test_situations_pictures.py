@@ -104,7 +104,7 @@ def banded(frames: Frames, value: float, rows: int = 18) -> Frames:
     [
         (lambda f: cut_off(f, 0, 1.5), "1500 counts"),
         (lambda f: cut_off(f, 0.9, 9), "900 counts"),
-        (lambda f: cut_off(f, 0.9, 1.6), "900 counts .*1600 counts"),
+        (lambda f: cut_off(f, 0.9, 1.6), "900 counts .*the least, in .*1600 counts .*the greatest"),
         (lambda f: banded(f, 0.001), "1 counts"),
         (lambda f: banded(f, 0.1), "100 counts"),
         (lambda f: banded(f, 2.047), "2047 counts"),
