@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
-from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks, repeated_pictures
+from flowlab.recordings.content import PictureDigest, digest, motion_checks, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.poses import check_known, poses_at
+from flowlab.recordings.repeats import find_repeats
 from flowlab.recordings.sync import nearest_sample, sampling_rate
 from flowlab.recordings.verdicts import Check
 
@@ -128,7 +129,8 @@ def check_frames(
     digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
-    checks = (repeats, *motion_checks(streams, digests[0], digests[1], stated))
+    told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
+    checks = (repeats, *motion_checks(streams, told[0], told[1], stated))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)

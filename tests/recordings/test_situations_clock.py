@@ -304,27 +304,6 @@ def test_a_clock_that_runs_away_or_is_set_back(tmp_path: Path, inspect: Inspect)
 # --- what pictures hold -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("froze", ["color", "depth", "both"])
-def test_a_camera_that_froze_is_named(tmp_path: Path, inspect: Inspect, froze: str) -> None:
-    """Row 19: eight pictures are the same, then there is a jump."""
-    shown = {t: 6 if 6 <= t < 14 else t for t in range(40)}
-    moving = {t: t for t in range(40)}
-    color, depth = (shown if froze in (name, "both") else moving for name in ("color", "depth"))
-    path = write(tmp_path / "r", *({NUMBER(t): k for t, k in s.items()} for s in (color, depth)), fps=FPS)
-    code, facts = inspect(path, "--set", "recording.max_bad_share=0.5")
-    assert (code, facts["rows"], len(facts["bad_frames"])) == (0, 33, 7)
-    assert "bit by bit" in facts["bad_frames"][0][1]
-    assert_refused(inspect(path), "7 of 40 frames are bad", "it froze")
-
-
-def test_a_picture_given_twice_is_named_and_a_still_scene_is_none(tmp_path: Path, inspect: Inspect) -> None:
-    color = {NUMBER(t): t - (t == 6) for t in range(STEPS)}
-    facts = assert_fine(inspect(write(tmp_path / "r", color, named(NUMBER, range(STEPS)), fps=FPS)))
-    assert any("1 pictures equal the one before: color/000006.png" in c["says"] for c in facts["checks"])
-    still = {NUMBER(t): max(t, 8) for t in range(STEPS)}
-    assert_fine(inspect(write(tmp_path / "still", still, still, fps=FPS)))
-
-
 @pytest.mark.parametrize("far", [65535, 9000])
 def test_depth_at_its_limit_is_no_reading(tmp_path: Path, inspect: Inspect, far: int) -> None:
     """Row 26: 65535, or the far plane of a renderer, in a part of every picture."""
