@@ -152,8 +152,10 @@ def _drifts(streams: Stamped, lags: Mapping[str, Float64[np.ndarray, "N"]]) -> I
     for name, change in changes.items():
         recorded_s = streams[name][1].recorded_s
         took_s = float(np.ptp(recorded_s)) if recorded_s is not None and len(recorded_s) else 0.0
-        by_itself = abs(change) if abs(change) > max(REFUSED_S, _RATE * took_s) else 0.0
-        size = max(abs(change - least), min(by_itself, REFUSED_S))
+        # Where the recorder's clock is set, or a queue fills at once, the lag of all changes in one step.
+        steadily = np.abs(np.diff(lags[name])).max(initial=0.0) < abs(change) / 2
+        by_itself = steadily and abs(change) > max(REFUSED_S, _RATE * took_s)
+        size = max(abs(change - least), REFUSED_S if by_itself else 0.0)
         if size > DOUBTFUL_S and not any(_set({name: streams[name]}, {name: lags[name]})):
             yield _Fault(size, f"the stamps of {name} drift or jump by {_ms(abs(change))} against the times of recording")
 
