@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
+from flowlab.recordings.dates import check_no_dates
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.numbering import check_numbers
 from flowlab.recordings.record_times import choose_clock, was_set_back
@@ -60,6 +61,8 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
     state, action = (
         tuple(_in_order(s, s.name, recorded) for s in samples) for samples in (streams.state, streams.action)
     )
+    for s in (color, depth, *state, *action):
+        check_no_dates(s.time_s, s.timing)
     units = [decide_unit(s.time_s, s.timing, fps=known.fps, stated=known.time_unit) for s in (color, depth)]
     if "frames" in units and units[0] != units[1]:
         raise UnclearStamps(
@@ -206,7 +209,7 @@ def _clock_words(streams: Streams, units: Sequence[str], known: Metadata) -> tup
     """In which unit the stamps of pictures are, and how that is known."""
     found, verdict = [], Verdict.OK
     for name, stream, unit in (("color", streams.color, units[0]), ("depth", streams.depth, units[1])):
-        how = f"as 'fps: {known.fps:g}' says" if unit == "frames" else "as the layout says"
+        how = f"with 'fps: {known.fps:g}'" if unit == "frames" else "as the layout says"
         if unit != "frames" and stream.timing.unit is None:
             how = "as 'time_unit' says" if known.time_unit else "by how they step and where they begin"
             verdict = verdict if unit == "s" or known.time_unit else Verdict.ASSUMED

@@ -218,8 +218,8 @@ def test_lists_in_any_unit(tmp_path: Path, inspect: Inspect, stamp: Callable[[in
 @pytest.mark.parametrize(
     ("stamp", "keys", "words"),
     [
-        (str, {}, ("may be numbers of frames or s", "'fps: 30'")),
-        (lambda t: f"{5 * t}.0", {}, ("may be s or ms",)),
+        (str, {}, ("may be numbers of frames or s (1 pictures a second)", "'fps: 30'")),
+        (lambda t: f"{5 * t}.0", {}, ("may be s (0.2 pictures a second) or ms (200",)),
         (lambda t: f"{EPOCH + t / 10:.4f}", {"fps": 30}, ("'fps: 30' contradicts",)),
         (lambda t: str(50 * t), {"time_unit": "s"}, ("step by 50 s", "'time_unit: ms'")),
         (lambda t: f"{100 * t}e9", {}, ("no plausible time",)),
