@@ -2,7 +2,7 @@
 
 import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -49,7 +49,7 @@ def motion_of(name: str, stream: ImageStream, digests: Mapping[int, PictureDiges
 
 
 def motion_checks(
-    streams: Streams, color: Mapping[int, PictureDigest], depth: Mapping[int, PictureDigest], stated: Sequence[str]
+    streams: Streams, color: Mapping[int, PictureDigest], depth: Mapping[int, PictureDigest], stated: Mapping[str, float]
 ) -> tuple[Check, ...]:
     """Whether depth and the robot move when the color pictures change.
 
@@ -57,17 +57,17 @@ def motion_checks(
         streams: The recording.
         color: What is kept of color pictures, by index.
         depth: Likewise of depth pictures.
-        stated: Names of the streams of which the user says how they belong to color: depth, state.
+        stated: What the user has added to the times of a stream [s]: of depth, of state.
     """
     if len(color) < 2 or len(depth) < 2:
         return ()
     pictures = motion_of("color", streams.color, color)
-    found = [check_motion(pictures, motion_of("depth", streams.depth, depth), "depth" in stated)]
+    found = [check_motion(pictures, motion_of("depth", streams.depth, depth), stated.get("depth"))]
     for s in streams.state[:1]:
         if len(s.time_s) > 1 and s.values.shape[1]:
             reach = np.maximum(np.ptp(s.values, axis=0), 1e-9)
             change = np.linalg.norm(np.diff(s.values, axis=0) / reach, axis=1).astype(np.float64)
-            found.append(check_motion(pictures, Motion.make("the robot", s.time_s, change), "state" in stated))
+            found.append(check_motion(pictures, Motion.make("the robot", s.time_s, change), stated.get("state")))
     return tuple(found)
 
 

@@ -1,7 +1,7 @@
 """The first pass over a recording: which frames make rows, and which are bad, by name and reason."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -81,15 +81,15 @@ def check_frames(
     max_sync_s: float,
     max_state_s: float,
     pose_gap_s: float = 0.0,
-    stated: Sequence[str] = (),
+    stated: Mapping[str, float] | None = None,
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
     an interval; where no poses of a camera that moves are around it that are at most ``pose_gap_s`` apart; and where
-    its time does not lie after the frame before. ``stated`` are the streams of which the user
-    says how they belong to color.
+    its time does not lie after the frame before. ``stated`` is what the user has added to
+    the times of a stream.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
@@ -130,7 +130,7 @@ def check_frames(
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
     told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
-    checks = (repeats, *motion_checks(streams, told[0], told[1], stated))
+    checks = (repeats, *motion_checks(streams, told[0], told[1], stated or {}))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)

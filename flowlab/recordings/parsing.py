@@ -152,7 +152,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         max_sync_s=settings.max_sync_s,
         max_state_s=settings.max_state_s,
         pose_gap_s=most_apart_s(streams.color, metadata.T_world_cam_gap_s),
-        stated=[name for name in ("depth", "state") if getattr(metadata, f"{name}_offset_s") is not None],
+        stated={s: off for s in ("depth", "state") if (off := getattr(metadata, f"{s}_offset_s")) is not None},
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
 
