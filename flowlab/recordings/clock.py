@@ -61,8 +61,10 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
     state, action = (
         tuple(_in_order(s, s.name, recorded) for s in samples) for samples in (streams.state, streams.action)
     )
-    for s in (color, depth, *state, *action):
-        check_no_dates(s.time_s, s.timing)
+    for time_s, timing in ((s.time_s, s.timing) for s in (color, depth)):
+        check_no_dates(time_s, timing)
+    for sample in (*state, *action):
+        check_no_dates(sample.time_s, sample.timing)
     units = [decide_unit(s.time_s, s.timing, fps=known.fps, stated=known.time_unit) for s in (color, depth)]
     if "frames" in units and units[0] != units[1]:
         raise UnclearStamps(
@@ -122,8 +124,10 @@ def _in_order(stream: AnyStream, name: str, recorded: bool) -> AnyStream:
     order = np.argsort(stamps, kind="stable")
     steps = np.diff(stamps[order])
     usual = np.median(steps)
-    overtaken = timing.overtaking and -np.diff(stamps).min() <= _OVERTAKEN * usual and (
-        timing.recorded_s is None or not was_set_back(stamps, timing.recorded_s)
+    overtaken = (
+        timing.overtaking
+        and -np.diff(stamps).min() <= _OVERTAKEN * usual
+        and (timing.recorded_s is None or not was_set_back(stamps, timing.recorded_s))
     )
     if overtaken and steps.min() >= _IN_ORDER * usual:
         return _reordered(replace(stream, time_s=stamps), order)

@@ -49,7 +49,10 @@ def motion_of(name: str, stream: ImageStream, digests: Mapping[int, PictureDiges
 
 
 def motion_checks(
-    streams: Streams, color: Mapping[int, PictureDigest], depth: Mapping[int, PictureDigest], stated: Mapping[str, float]
+    streams: Streams,
+    color: Mapping[int, PictureDigest],
+    depth: Mapping[int, PictureDigest],
+    stated: Mapping[str, float],
 ) -> tuple[Check, ...]:
     """Whether depth and the robot move when the color pictures change.
 

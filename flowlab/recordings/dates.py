@@ -123,7 +123,9 @@ def check_no_dates(stamps: Float64[np.ndarray, "N"], timing: Timing) -> None:
     if low > 1.9e13 and high < 2.1e16:
         whole = [f"{s:.0f}" for s in np.floor(stamps)]
         if all(_STAMP.fullmatch(w) for w in whole):
-            raise UnclearStamps(f"{timing.source} are dates (YYYYMMDDhhmmss), as {whole[0]}, and no count of time; {_WRITE}")
+            raise UnclearStamps(
+                f"{timing.source} are dates (YYYYMMDDhhmmss), as {whole[0]}, and no count of time; {_WRITE}"
+            )
     if not (0 <= low < high < 240_000 and len(stamps) > 2):
         return
     of_day = [_OF_DAY.fullmatch(f"{s:013.6f}") for s in stamps]

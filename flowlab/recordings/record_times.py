@@ -157,7 +157,9 @@ def _drifts(streams: Stamped, lags: Mapping[str, Float64[np.ndarray, "N"]]) -> I
         by_itself = steadily and abs(change) > max(REFUSED_S, _RATE * took_s)
         size = max(abs(change - least), REFUSED_S if by_itself else 0.0)
         if size > DOUBTFUL_S and not any(_set({name: streams[name]}, {name: lags[name]})):
-            yield _Fault(size, f"the stamps of {name} drift or jump by {_ms(abs(change))} against the times of recording")
+            yield _Fault(
+                size, f"the stamps of {name} drift or jump by {_ms(abs(change))} against the times of recording"
+            )
 
 
 def _change(lag: Float64[np.ndarray, "N"]) -> float:

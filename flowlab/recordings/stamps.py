@@ -1,6 +1,6 @@
 """The unit of stamps: stated by a standard or by the user, else decided by evidence, else asked for."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -148,7 +148,7 @@ def _is_even(stamps: Float64[np.ndarray, "N"], step: float) -> bool:
     return bool(np.all(np.diff(stamps) % step == 0))
 
 
-def _unclear(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None, units: list[str]) -> str:
+def _unclear(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None, units: Sequence[str]) -> str:
     """Why the unit of stamps is not clear, and what to write."""
     step = _step(stamps)
     found = f"{timing.source} step by {step:g}{'' if fps is None else f' where fps is {fps:g}'}"
@@ -157,10 +157,12 @@ def _unclear(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None
         rates = [f"numbers of frames, of which every {step:g}th was kept ({fps / step:.3g} pictures a second)"]
     kept = bool(rates) and fps is not None
     rates += [f"{u} ({1 / (step * SECONDS[u]):.3g} pictures a second)" for u in units if u != "frames"]
+    write = _write(fps, kept)
     if not rates:
-        return f"{found}: no plausible time in {_or(SECONDS)}, and no numbers of frames; they may count ticks; {_write(fps, False)}"
+        none = f"no plausible time in {_or(SECONDS)}, and no numbers of frames"
+        return f"{found}: {none}; they may count ticks; {write}"
     ticks = "" if fps is not None or "frames" in units or len(units) > 1 else ", or ticks of another length"
-    return f"when the pictures were taken is not known: {found} and may be {' or '.join(rates)}{ticks}; {_write(fps, kept)}"
+    return f"when the pictures were taken is not known: {found} and may be {' or '.join(rates)}{ticks}; {write}"
 
 
 def _check_step(step: float, unit: str, timing: Timing, bounds: tuple[float, float]) -> None:
@@ -168,7 +170,11 @@ def _check_step(step: float, unit: str, timing: Timing, bounds: tuple[float, flo
     took = step * SECONDS[unit]
     if np.isfinite(took) and not bounds[0] * 0.999 <= took <= bounds[1]:
         likely = [u for u in _units(step, bounds) if u != unit and _is_usual(step, u)]
-        write = f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s" if likely else _write(1, False)
+        write = (
+            f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s"
+            if likely
+            else _write(1, False)
+        )
         raise UnclearStamps(
             f"{timing.source} step by {took:.3g} s if they are in {unit}, expected {bounds[0]:.2g} to {bounds[1]:g} s "
             f"between pictures; {write}"

@@ -109,9 +109,7 @@ def test_a_camera_slower_than_its_recorder_is_named(
         lambda: [(film(max(t, 12), 0.0)[0], film(max(t, 12), 2.0)[1] + t % 2) for t in range(FRAMES)],
     ],
 )
-def test_scenes_that_stand_still_froze_not(
-    tmp_path: Path, inspect: Inspect, frames: Callable[[], list[Frame]]
-) -> None:
+def test_scenes_that_stand_still_froze_not(tmp_path: Path, inspect: Inspect, frames: Callable[[], list[Frame]]) -> None:
     code, facts = inspect(write(tmp_path / "r", frames()))
     assert (code, facts["bad_frames"]) == (0, [])
     assert {c["verdict"] for c in facts["checks"] if c["about"] == "repeats"} <= {"ok", "assumed"}, facts["checks"]

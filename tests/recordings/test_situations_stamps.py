@@ -15,16 +15,16 @@ STEPS = 20
 Name = Callable[[int], str]
 
 
-def check(tmp_path: Path, inspect: Inspect, name: Name, fps: float | None, *words: str, **keys: Any) -> None:
+def check(tmp_path: Path, inspect: Inspect, name: Name, rate: float | None, *words: str, **keys: Any) -> None:
     """Names are read at a rate without a gap, or refused with these words."""
     streams = [named(name, range(STEPS))] * 2
     found = inspect(write(tmp_path / "r", *streams, **keys))
-    if fps is None:
+    if rate is None:
         assert_refused(found, *words)
     else:
         facts = assert_fine(found)
         assert facts["rows"] == STEPS
-        assert facts["streams"][0]["fps"] == pytest.approx(fps, rel=0.02)
+        assert facts["streams"][0]["fps"] == pytest.approx(rate, rel=0.02)
         assert facts["streams"][0]["gaps_s"] == []
 
 
@@ -125,9 +125,7 @@ DATES = ["%Y%m%d%H%M%S%f", "%Y%m%d_%H%M%S_%f", "%Y-%m-%dT%H-%M-%S.%fZ", "%Y-%m-%
 
 @pytest.mark.parametrize("pattern", DATES)
 @pytest.mark.parametrize("keys", [{}, {"fps": 10}])
-def test_dates_in_names_are_read_as_dates(
-    tmp_path: Path, inspect: Inspect, pattern: str, keys: dict[str, Any]
-) -> None:
+def test_dates_in_names_are_read_as_dates(tmp_path: Path, inspect: Inspect, pattern: str, keys: dict[str, Any]) -> None:
     """Row 11: a minute has 60 seconds, so none is missing after the 59th."""
     check(tmp_path, inspect, dated(pattern), 10, **keys)
 
