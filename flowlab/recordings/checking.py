@@ -9,6 +9,7 @@ from flowlab.recordings.left_out import check_widths_known, find_left_out
 from flowlab.recordings.motion_check import check_motion
 from flowlab.recordings.pose_check import check_poses_fit
 from flowlab.recordings.registration_check import check_registration
+from flowlab.recordings.unused_times import check_unused_times
 from flowlab.recordings.verdicts import Check
 from flowlab.recordings.world_check import check_world
 
@@ -21,6 +22,7 @@ def check_recording(source: "ParsedRecording") -> Iterator[Check]:
     yield from _geometry(source)
     yield from check_widths_known(source)
     yield from find_left_out(source)
+    yield from check_unused_times(source)
 
 
 def _geometry(source: "ParsedRecording") -> Iterator[Check]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from real_recordings import INTRINSICS, write_yaml
-from test_situations_clock import Inspect, assert_fine, assert_refused, inspect, named, write, write_lists
+from test_situations_clock import Inspect, assert_fine, assert_refused, inspect, named, picture, write, write_lists
 
 __all__ = ["inspect"]
 STEPS = 20
@@ -174,3 +174,61 @@ def test_dates_in_lists_and_tables_are_no_numbers(tmp_path: Path, inspect: Inspe
     assert_refused(inspect(path), word, "no count of time")
     (path / "times.txt").write_text("\n".join(str(s) for s in np.arange(STEPS) / 10 + 59.1))
     assert_fine(inspect(path))
+
+
+# --- times that lie beside --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("file", "step", "key"),
+    [
+        ("timestamps.txt", 0.2, "times: timestamps.txt"),
+        ("times.txt", 200.0, "times: times.txt"),
+        ("color_ts.npy", 0.2, "times: color_ts.npy"),
+        ("depth_timestamps.txt", 0.2, "depth_times: depth_timestamps.txt"),
+        ("timestamps.csv", 0.1, "times: timestamps.csv"),  # with names of columns: it is not read
+        ("timestamps.txt", 0.1, None),
+        ("times.npy", 100.0, None),
+        ("time_of_flight_notes.txt", None, "times"),
+    ],
+)
+def test_times_beside_the_pictures_are_compared(
+    tmp_path: Path, inspect: Inspect, file: str, step: float | None, key: str | None
+) -> None:
+    """Times that nothing names, where 'fps' tells others."""
+    path = write(tmp_path / "r", *[named("{:04d}".format, range(STEPS))] * 2, fps=10)
+    values = 1.7e9 + np.arange(STEPS) * (step or 0) if (step or 0) < 1 else np.arange(STEPS) * (step or 0)
+    text = "\n".join(map(str, values)) if step else "words"
+    if file.endswith(".npy"):
+        np.save(path / file, values)
+    else:
+        (path / file).write_text("timestamp\n" + text if file.endswith(".csv") else text)
+    facts = assert_fine(inspect(path), doubtful=True)
+    doubts = [c["says"] for c in facts["checks"] if c["verdict"] == "doubtful"]
+    assert [key in d for d in doubts] == [True] if key else doubts == []
+
+
+@pytest.mark.parametrize(
+    ("name", "late", "fine"),
+    [("depth_timestamps", 0.2, False), ("state_timestamps", 0.3, False), ("color_timestamps", 0.0, True),
+     ("depth_timestamps", 0.01, True)],
+)  # fmt: skip
+@pytest.mark.parametrize("packed", [True, False])
+def test_times_in_arrays_are_compared(
+    tmp_path: Path, inspect: Inspect, name: str, late: float, fine: bool, packed: bool
+) -> None:
+    times = np.arange(STEPS) / 10
+    color, depth = (np.stack([picture(t)[which] for t in range(STEPS)]) for which in (0, 1))
+    arrays = {"img": color, "depth": depth, "timestamp": times, "state": np.random.default_rng(0).random((STEPS, 3))}
+    arrays[name] = times + late
+    path = tmp_path / "r.npz" if packed else tmp_path / "r"
+    if packed:
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+    else:
+        path.mkdir()
+        for array, values in arrays.items():
+            np.save(path / f"{array}.npy", values)
+    beside = path.with_suffix(".yaml") if packed else path / "recording.yaml"
+    write_yaml(beside, intrinsics=INTRINSICS, depth_unit_m=0.001)
+    facts = assert_fine(inspect(path), doubtful=True)
+    assert (not [c for c in facts["checks"] if c["about"] == "times"]) == fine
