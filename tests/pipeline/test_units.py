@@ -3,7 +3,7 @@
 import random
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +15,7 @@ from thoroughness import THOROUGH, examples
 
 from flowlab.engines.base import UnitResult
 from flowlab.errors import UsageError
+from flowlab.pipeline import filling
 from flowlab.pipeline.filling import run_all
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler, SeedScheduler, next_units, unit_size
 from flowlab.pipeline.units import JobShard, WorkUnit
@@ -126,6 +127,14 @@ def check_seeds(world: World, wanted: dict[str, int], first_seed: int) -> None:
         mine = [r for r in receipts if r.task == task]
         assert sorted(s for r in mine for s in r.accepted) == successes
         assert sorted(s for r in mine for s in r.seeds) == list(range(first_seed, beyond + 1))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_summaries() -> Iterator[None]:
+    """Nothing but receipts is in these folders, and on a slow machine a summary would be due."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(filling, "_SECONDS_BETWEEN_SUMMARIES", float("inf"))
+        yield
 
 
 MANY = (40, 70) if THOROUGH else (48,)
