@@ -28,6 +28,10 @@ _UNLIKE = -0.2
 """Correlation of two changes in a row: near -0.5 for noise, as what was added is gone again, above for motion."""
 _OF_CONTRAST = 0.35
 """Noise is less than this share of the contrast; a change of this size is motion."""
+_ALL_OVER = 0.5
+"""A camera that moves changes this share of the pixels."""
+_AT_ONCE = 0.5
+"""It stops at once where the last change is more than this share of what is usual."""
 _NEARLY = 0.02
 """Pictures with noise that differ in less than this share of the pixels are one, as where a clock is drawn over it."""
 _FEWEST = 4
@@ -83,6 +87,16 @@ class _Pictures:
         usual = np.median(self.change[~self.same])
         return not self.noisy or change_between(self.kept[first], self.kept[last]) > _OVER_NOISE * usual
 
+    def stopped_at_once(self, first: int, last: int) -> bool:
+        """Whether a run follows pictures that changed all over, as of a camera that moves, which did not slow down."""
+        new = self.change[~self.same]
+        beside = [*self.change[max(0, first - 1) : first], *self.change[last : last + 1]]
+        if last - first + 1 < _RUN or len(new) < _FEWEST or not beside:
+            return False
+        differ = [(a.small != b.small).mean() >= _ALL_OVER for a, b in pairwise(self.kept)]
+        moving = np.array(differ)[~self.same].mean() >= _NOISY[1]
+        return bool(moving and min(beside) > _AT_ONCE * np.median(new))
+
     @cached_property
     def cadence(self) -> float | None:
         """Rows for each new picture, where these come steadily but more rarely than rows; None where not."""
@@ -130,6 +144,7 @@ def find_repeats(
     bad: dict[int, str] = {}
     named: dict[int, str] = {}
     still: set[int] = set()
+    at_once: set[int] = set()
     for one, other in (seen, seen[::-1]):
         for first, last in _runs(one.same):
             proven = one.froze(first, last) or other.moved(first, last) or _robot_moved(state, first, last)
@@ -140,12 +155,18 @@ def find_repeats(
             elif proven:
                 named.update({k: one.name(k) for k in again})
             else:
-                still.update(again)
-    return bad, _check(bad, {k: n for k, n in named.items() if k not in bad}, still - {*bad, *named}, seen)
+                (at_once if one.stopped_at_once(first, last) else still).update(again)
+    return bad, _check(
+        bad, {k: n for k, n in named.items() if k not in bad}, still - {*bad, *named, *at_once}, at_once - {*bad}, seen
+    )
 
 
 def _check(
-    bad: Mapping[int, str], named: Mapping[int, str], still: set[int], seen: tuple[_Pictures, _Pictures]
+    bad: Mapping[int, str],
+    named: Mapping[int, str],
+    still: set[int],
+    at_once: set[int],
+    seen: tuple[_Pictures, _Pictures],
 ) -> Check:
     """What came of looking for repeats."""
     rows = len(seen[0].kept)
@@ -154,10 +175,15 @@ def _check(
         says += f"; {len(named)} pictures equal the one before: {', '.join(list(named.values())[:3])}"
     if still:
         says += f"; {len(still)} equal the one before while nothing else moved, as in a scene that stands still"
+    if at_once:
+        says += (
+            f"; {len(at_once)} equal the one before, from {seen[0].name(min(at_once))} on, and next to them everything "
+        )
+        says += "moves: the camera froze, or stopped at once"
     slow = [p for p in seen if p.cadence is not None]
     for name, p in zip(("color", "depth"), seen, strict=True):
         says += f"; {name}: {_slower(p)}" if p.cadence is not None else ""
-    many = bool(bad) or bool(slow) or len(named) > _MANY * rows
+    many = bool(bad) or bool(slow) or bool(at_once) or len(named) > _MANY * rows
     return Check("repeats", Verdict.DOUBTFUL if many else Verdict.ASSUMED if still or named else Verdict.OK, says)
 
 

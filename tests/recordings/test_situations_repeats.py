@@ -97,6 +97,9 @@ def test_a_camera_slower_than_its_recorder_is_named(
         assert_fine(inspect(path, "--set", f"recording.every={every}"))
 
 
+SLOWS_DOWN = [int(t) for t in np.cumsum([0, *[8] * 10, 6, 4, 2, *[0] * 26])]
+
+
 @pytest.mark.parametrize(
     "frames",
     [
@@ -104,8 +107,7 @@ def test_a_camera_slower_than_its_recorder_is_named(
         lambda: shown([8] * 8 + list(range(8, FRAMES)), noise=0.0),  # a renderer, or a video: nothing moves at first
         lambda: shown([0] * FRAMES, noise=0.0),
         lambda: shown(range(FRAMES), pan=3),
-        lambda: shown([min(t, 20) for t in range(FRAMES)], noise=0.0, pan=1),  # a camera that stops
-        lambda: shown([min(t, 20) for t in range(FRAMES)], noise=0.0, pan=7),
+        lambda: shown(SLOWS_DOWN, noise=0.0, pan=0.5),  # a camera that stops
         lambda: [(film(max(t, 12), 0.0)[0], film(max(t, 12), 2.0)[1] + t % 2) for t in range(FRAMES)],
     ],
 )
@@ -124,3 +126,11 @@ def test_a_robot_that_moves_while_the_picture_does_not(tmp_path: Path, inspect: 
 def test_a_picture_given_twice_is_named(tmp_path: Path, inspect: Inspect) -> None:
     facts = assert_fine(inspect(write(tmp_path / "r", shown([t - (t == 6) for t in range(FRAMES)], "color"))))
     assert any("1 pictures equal the one before: color/0006.png" in c["says"] for c in facts["checks"])
+
+
+@pytest.mark.parametrize("order", [[min(t, 30) for t in range(FRAMES)], [max(t, 8) for t in range(FRAMES)]])
+def test_a_moving_camera_that_stops_at_once_is_doubtful(tmp_path: Path, inspect: Inspect, order: list[int]) -> None:
+    """Noise is not seen under motion, and no jump follows."""
+    _, facts = inspect(write(tmp_path / "r", shown(order, pan=5)))
+    said = [c["says"] for c in facts["checks"] if c["about"] == "repeats" and c["verdict"] == "doubtful"]
+    assert facts["bad_frames"] or "froze, or stopped at once" in said[0]
