@@ -138,11 +138,14 @@ def _offsets(streams: Stamped, middle: Mapping[str, float], known: Metadata) -> 
         off = lag - first
         if abs(off) > DOUBTFUL_S:
             key = streams[name][2]
-            stated = key in known.model_fields_set
+            # One offset is for state and actions: it cannot be right for both where these differ.
+            of_key = [lag for other, lag in middle.items() if streams[other][2] == key]
+            one = max(of_key) - min(of_key) <= DOUBTFUL_S
+            stated = one and key in known.model_fields_set
             total = off + (getattr(known, key) or 0.0)
             says = f"the clock of {name} is {_ms(abs(off))} {'behind' if off > 0 else 'ahead of'} that of color"
             says += f", with '{key}: {getattr(known, key):g}' added" if stated else ""
-            yield _Fault(abs(off), says, f"'{key}: {total:.3g}'", stated)
+            yield _Fault(abs(off), says, f"'{key}: {total:.3g}'" if one else "", stated)
 
 
 def _drifts(streams: Stamped, lags: Mapping[str, Float64[np.ndarray, "N"]]) -> Iterator[_Fault]:
