@@ -85,8 +85,12 @@ def find_turns(values: Float64[np.ndarray, "N D"]) -> tuple[int, int] | None:
 
     A row is a leap where it lies far from the one before, and near one of the three before that.
     """
-    columns = [k for k in range(values.shape[1]) if len(np.unique(values[:, k])) >= _VALUES]
-    if len(values) < _FEWEST or not columns:
+    if len(values) < _FEWEST:
+        return None
+    count = [len(np.unique(column)) for column in values.T]
+    moving = [k for k, n in enumerate(count) if n > 1]
+    columns = [k for k in moving if count[k] >= _VALUES] or (moving if len(moving) >= _COLUMNS else [])
+    if not columns:
         return None
     if len(columns) < _COLUMNS:
         return next(((k, n) for k in columns if (n := _between_places(values[:, k]))), None)
