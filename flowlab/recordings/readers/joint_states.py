@@ -85,15 +85,12 @@ def _of_publishers(rows: list[dict[str, float]], publishers: Sequence[str]) -> l
             owners[name].add(publisher)
     if all(len(owner) < 2 for owner in owners.values()):
         return rows
-    return [
-        {
-            f"{publisher}/{name.rpartition(' ')[2] if name.startswith(_UNNAMED) else name}"
-            if len(owners[name]) > 1
-            else name: x
-            for name, x in row.items()
-        }
-        for row, publisher in zip(rows, publishers, strict=True)
-    ]
+
+    def called(name: str, publisher: str) -> str:
+        plain = name.rpartition(" ")[2] if name.startswith(_UNNAMED) else name
+        return f"{publisher}/{plain}" if len(owners[name]) > 1 else name
+
+    return [{called(name, who): x for name, x in row.items()} for row, who in zip(rows, publishers, strict=True)]
 
 
 def _worst(names: Sequence[str], finite: np.ndarray) -> str:

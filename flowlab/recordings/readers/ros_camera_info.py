@@ -58,7 +58,7 @@ def _constant(info: str, found: Sequence[Intrinsics], given: Intrinsics | None, 
         return [Check(f"{about} over time", Verdict.OK, f"all messages of {info} say the same")]
     seen = [f"fx {camera.fx:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}" for camera in (first, other)]
     says = (f"{info} changes in the recording, from {seen[0]} to {seen[1]}, as of a camera that zooms or "
-            f"was started anew, or of two; cut the recording there, or write '{about}' if one holds for all pictures")  # fmt: skip
+            f"was started anew, or of two; cut it there, or write '{about}' if one holds for all pictures")  # fmt: skip
     refused = apart > _OTHER[1] and given is None
     return [Check(f"{about} over time", Verdict.REFUSED if refused else Verdict.DOUBTFUL, says)]
 

@@ -30,19 +30,20 @@ def group_samples(
         DataError: The numbers are not the same from message to message.
     """
     apart = tell_apart(sent)
-    checks = []
-    if apart is not None:
-        says = (f"several publish on one topic in turn, told apart by {apart[1]} ({counted(apart[0])} messages); their "
-                "numbers stand side by side, with that before their names")  # fmt: skip
-        checks.append(Check(f"{what} publishers", Verdict.ASSUMED, says))
     names = [] if apart is None else apart[0]
+    checks: list[Check] = []
     if joints and any(len(m.position) for m in messages):
-        groups, told = join_by_name(place, messages, names)
+        groups, checks = join_by_name(place, messages, names)
         _check_unnamed(place, what, groups)
-        return groups, [*checks, *told]
-    _check_frame(place, what, sent, apart is not None)
-    each = [np.flatnonzero([name == one for name in names]) for one in dict.fromkeys(names)]
-    return [_unnamed(place, what, messages, which, names) for which in each or [np.arange(len(messages))]], checks
+    else:
+        _check_frame(place, what, sent, apart is not None)
+        each = [np.flatnonzero([name == one for name in names]) for one in dict.fromkeys(names)]
+        groups = [_unnamed(place, what, messages, k, names) for k in each or [np.arange(len(messages))]]
+    if apart is not None and any(name.startswith(f"{who}/") for g in groups for name in g.names for who in set(names)):
+        says = (f"several publish on one topic in turn, told apart by {apart[1]} ({counted(names)} messages); their "
+                "numbers stand side by side, with that before their names")  # fmt: skip
+        checks = [Check(f"{what} publishers", Verdict.ASSUMED, says), *checks]
+    return groups, checks
 
 
 def _check_frame(place: str, what: str, sent: Sequence[Who], apart: bool) -> None:
