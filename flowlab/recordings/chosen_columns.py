@@ -1,4 +1,4 @@
-"""The numbers of a robot that the user chooses by name, from whatever reader they are; what cannot be chosen is refused."""
+"""The numbers of a robot that the user chooses by name, whichever reader they are from; else the choice is refused."""
 
 from collections.abc import Sequence
 from dataclasses import replace

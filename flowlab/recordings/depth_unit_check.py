@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 CUSTOM = "the custom of "
 """Begins the origin of what no file says."""
-_UNITS = (1.0, 0.001, 0.00025, 0.0001, 0.0002)
+_UNITS = (1.0, 0.001, 0.0001, 0.00025, 0.0002)
+"""Of depth pictures, the most usual first [m]."""
 _POSSIBLE_M = (0.02, 100.0)
 """The median depth of a recording lies between these [m]."""
 _WORKSPACE_M = (0.15, 5.0)
 """A camera that sees a robot at work has its median depth between these [m]."""
-_TYPICAL_M = 0.8
-"""A camera stands about so far from a robot's workspace, and hardly beyond the next [m]."""
 _FAR_M = 3.0
+"""Beyond this [m] it is unusual that far."""
 _SENSED_M = (0.15, 10.0)
 """Where depth cameras measure [m]."""
 _SATURATED = 65535
@@ -30,10 +30,9 @@ _VARIED = 50
 
 def likely_unit(median_counts: float) -> str:
     """The unit that would put readings into a workspace, as what to write."""
-    usual = [u for u in _UNITS if _WORKSPACE_M[0] < median_counts * u < _WORKSPACE_M[1]]
-    if not usual:
+    likely = next((u for u in _UNITS if _WORKSPACE_M[0] < median_counts * u < _FAR_M), None)
+    if likely is None:
         return "no unit that is usual would make that a robot's workspace"
-    likely = min(usual, key=lambda u: abs(np.log(median_counts * u / _TYPICAL_M)))
     return f"'depth_unit_m: {likely:g}' would make that {median_counts * likely:.3g} m"
 
 
