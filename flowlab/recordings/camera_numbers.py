@@ -14,6 +14,7 @@ _POSES = re.compile(
     r"pose|trajectory|extrin|c2w|w2c|cam(era)?_?(to|2)_?(world|base|robot)|(world|base|robot)_?(to|2)_?cam|"
     r"(^|_)t_\w*cam|(^|_)t_?(wc|cw)($|_)|transforms|ground_?truth"
 )
+_MATRIX = re.compile(r"intrin|cam(era)?_?(k|mat)|^k($|_)")
 _LENS = re.compile(r"dist(ort|_?coef|$|_)|(^|_)dist($|_)")
 _UNIT = re.compile(r"depth_?(scale|unit|factor)|unit_?m")
 _ROTATION = 1e-3
@@ -38,7 +39,7 @@ def camera_numbers(name: str, values: Num[np.ndarray, "..."], known: Metadata, p
     """
     if values.dtype.kind not in "iuf" or not values.size or not np.isfinite(values).all():
         return None
-    for says in (_lens(name, values, known), _unit(name, values, known), _intrinsics(values, known)):
+    for says in (_lens(name, values, known), _unit(name, values, known), _intrinsics(name, values, known)):
         if says is not None:
             return says
     return None if posed or _of_robot(name) else _poses(name, values, known)
@@ -80,7 +81,7 @@ def _rigid(values: np.ndarray, called: bool) -> np.ndarray | None:
     return T if off < _ROTATION and np.allclose(T[:, 3], (0, 0, 0, 1)) else None
 
 
-def _intrinsics(values: np.ndarray, known: Metadata) -> str | None:
+def _intrinsics(name: str, values: np.ndarray, known: Metadata) -> str | None:
     """What is said of camera matrices."""
     if values.ndim not in (2, 3) or values.shape[-2:] != (3, 3):
         return None
@@ -88,7 +89,7 @@ def _intrinsics(values: np.ndarray, known: Metadata) -> str | None:
     try:
         f = [focal_lengths(K) for K in (every[0], every[-1])]
     except ValueError:
-        return None
+        return "it is called as a camera's matrix and is none" if _MATRIX.search(name.lower()) else None
     at = np.array([[x["fx"], x["fy"], x["cx"], x["cy"]] for x in f])
     if (at[:, :2] <= 1).any() and (at[:, 2:] == 0).all():  # a rotation about the axis, or a scale
         return None

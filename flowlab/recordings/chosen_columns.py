@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream, Streams
@@ -22,7 +23,7 @@ def with_chosen_columns(path: Path, streams: Streams, known: Metadata) -> Stream
     Raises:
         DataError: Columns are named of numbers that have no names, or other ones; or times of what is no file.
     """
-    changed = {}
+    changed: dict[str, Any] = {}
     for what in ("state", "action"):
         if getattr(known, what) is not None:
             continue
@@ -49,7 +50,7 @@ def _choose(place: str, what: str, streams: Sequence[SampleStream], chosen: Sequ
             raise DataError(f"{place} names {shown(name)}, and the {what} has {have}")
     if len(set(chosen)) < len(chosen):
         raise DataError(f"{place} names a column twice; the {what} has {have}")
-    found = []
+    found: list[SampleStream] = []
     for i, run in groupby(chosen, key=lambda name: at[name][0]):
         names = tuple(run)
         values = streams[i].values[:, [at[name][1] for name in names]]

@@ -92,8 +92,8 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
                 f"{cut(file.name)} is not used; if it is the {what}, write '{what}: {cut(file.name)}' into {FILE_NAME}"
             )
             return Check(what, Verdict.DOUBTFUL, says)
-    says = _of_camera(source, file)
-    return None if says is None else Check("camera", Verdict.DOUBTFUL, f"{cut(file.name)} is not used; {says}")
+    why = _of_camera(source, file)
+    return None if why is None else Check("camera", Verdict.DOUBTFUL, f"{cut(file.name)} is not used; {why}")
 
 
 def _of_camera(source: "ParsedRecording", file: FoundFile) -> str | None:

@@ -113,8 +113,9 @@ def _between_places(column: Float64[np.ndarray, "N"]) -> int:
     gaps = np.diff(ranked)
     upper = column > ranked[int(gaps.argmax())]
     step = max(float(np.abs(np.diff(part)).max(initial=0.0)) for part in (column[upper], column[~upper]))
-    count = int((upper[1:] != upper[:-1]).sum())
-    turned = any(abs(np.ptp(column) / turn - 1) < 0.05 for turn in _TURN)
+    over = upper[1:] != upper[:-1]
+    count, leap = int(over.sum()), float(np.median(np.abs(np.diff(column))[over]))
+    turned = any(abs(leap / turn - 1) < 0.05 for turn in _TURN)
     return count if gaps.max() > _LEAP * step and count >= max(4, _TURNS * len(column)) and not turned else 0
 
 

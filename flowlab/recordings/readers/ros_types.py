@@ -50,7 +50,7 @@ def _learn(store: "Typestore", connection: "Connection", is2: bool) -> str | Non
     try:
         if definition.format.name != "NONE":
             found = _definitions(kind, definition.format.name, definition.data)
-            store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})  # type: ignore[attr-defined]
+            store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
         if kind not in store.types:
             return "its messages are of an unknown type"
         if connection.digest and definition.format.name != "NONE":
