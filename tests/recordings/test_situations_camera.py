@@ -35,7 +35,13 @@ OPEN3D = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": K.T.ravel().toli
         ({"k1": 0.3, "k2": -0.1, "p1": 0.0}, 0, "intrinsics", "ok", "of a pinhole of 8"),
         ({"D": [0.1, 0.01, 0, 0], "camera_model": "OPENCV_FISHEYE"}, 0, "intrinsics", "ok", "OPENCV_FISHEYE of 4"),
         ({"distortion": {"model": "fisheye", "coeffs": [0.1, 0, 0, 0]}}, 0, "intrinsics", "ok", "fisheye of 4"),
-        ({"dist_coeffs": BENT, "distortion_model": "fisheye"}, 3, "intrinsics", "refused", "5 coefficients"),
+        (
+            {"dist_coeffs": [0.3, -0.1, 0, 0, 0.2], "distortion_model": "fisheye"},
+            3,
+            "intrinsics",
+            "refused",
+            "5 coefficients",
+        ),
         ({"distortion": BENT, "model": "double_sphere"}, 3, "intrinsics", "refused", "'double_sphere' is not known"),
         ({"note": "of Monday"}, 0, "calibration", "ok", "keys that are not read: note"),
         ({"skew": 0.5, "note": ""}, 0, "calibration", "doubtful", "not read: note, skew; what skew says"),
@@ -130,8 +136,16 @@ def test_poses_in_files_are_asked_about(tmp_path: Path, capsys: Capture, files: 
     [
         ({"fx": 0.94, "fy": 1.25}, 3, "field of view of 17"),
         ({"cx": 11.7, "cy": 15.2}, 3, "cx and cy look swapped; .*cx: 15.2, cy: 11.7"),
-        ({"fx": 15.0, "fy": 15.5, "cx": 7.35, "cy": 5.6}, 3, "the same pictures in 16x12; .*fx: 30.0, fy: 31.0, cx: 15.2"),
-        ({"fx": 150.0, "fy": 155.0, "cx": 78.0, "cy": 60.5}, 3, "same pictures in 160x120; .*fx: 30.0, fy: 31.0, cx: 15.2"),
+        (
+            {"fx": 15.0, "fy": 15.5, "cx": 7.35, "cy": 5.6},
+            3,
+            "the same pictures in 16x12; .*fx: 30.0, fy: 31.0, cx: 15.2",
+        ),
+        (
+            {"fx": 150.0, "fy": 155.0, "cx": 78.0, "cy": 60.5},
+            3,
+            "same pictures in 160x120; .*fx: 30.0, fy: 31.0, cx: 15.2",
+        ),
         ({"cx": 15.2, "cy": 8.0}, 0, "cropped: true"),
         ({}, 0, ""),
     ],
@@ -146,7 +160,9 @@ def test_intrinsics_of_other_pictures_say_which(
     assert "cropped" in words or "cropped" not in checks["intrinsics"][1]
 
 
-@pytest.mark.parametrize(("counts_", "says"), [(4400, "0.0001"), (1200, "0.001"), (0.9, "1"), (12.6, "no unit"), (1e9, "no")])
+@pytest.mark.parametrize(
+    ("counts_", "says"), [(4400, "0.0001"), (1200, "0.001"), (0.9, "1"), (12.6, "no unit"), (1e9, "no")]
+)
 def test_a_unit_is_advised_only_where_it_fits(counts_: float, says: str) -> None:
     assert says in likely_unit(counts_)
 

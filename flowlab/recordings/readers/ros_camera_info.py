@@ -15,7 +15,7 @@ _OTHER = (0.001, 0.01)
 """Intrinsics that change by these shares of the focal length are doubtful, and refused."""
 _RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
 """As ``image_proc`` and drivers call rectified pictures."""
-_STRAIGHT = re.compile(r"undist|unwarp|dewarp|de_?fish|rectif|(?<![a-z])rect|corrected")
+_STRAIGHT = re.compile(r"undist|unwarp|dewarp|de_?fish|rectif|(?<![a-z])rect(?!ang)|corrected")
 _BENT = re.compile(r"(?<![a-z])(un|non|not)_?rect|(?<!un)distorted|(?<![a-z])raw(?![a-z])")
 
 
