@@ -96,7 +96,9 @@ def _judged(unit: float, readings: _Readings, custom: bool) -> tuple[Verdict, st
         return Verdict.REFUSED, ", which cannot be"
     likely = _WORKSPACE_M[0] < median < _WORKSPACE_M[1]
     if not custom:
-        return (Verdict.OK, "") if likely or median < _SENSED_M[1] else (Verdict.DOUBTFUL, ", far for a depth camera")
+        if not _SENSED_M[0] < median < _SENSED_M[1]:
+            return Verdict.DOUBTFUL, f", {'near' if median < 1 else 'far'} for a depth camera"
+        return Verdict.OK, ""
     if not likely or high > 2 * _SENSED_M[1]:
         return Verdict.REFUSED, ", which is not a robot's workspace, and no file says that unit"
     if median > _FAR_M:

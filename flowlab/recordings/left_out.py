@@ -92,8 +92,29 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
                 f"{cut(file.name)} is not used; if it is the {what}, write '{what}: {cut(file.name)}' into {FILE_NAME}"
             )
             return Check(what, Verdict.DOUBTFUL, says)
+    if (asked := _of_rows(source, file)) is not None:
+        return asked
     why = _of_camera(source, file)
     return None if why is None else Check("camera", Verdict.DOUBTFUL, f"{cut(file.name)} is not used; {why}")
+
+
+def _of_rows(source: "ParsedRecording", file: FoundFile) -> Check | None:
+    """A doubt about a file with a time, or with numbers, for every picture; None where it has neither."""
+    values, stem = _values(file.path), Path(file.name).stem.lower()
+    steps = {len(source.streams.color), len(source.streams.depth)}
+    if values is None or values.ndim not in (1, 2) or len(values) not in steps or called_poses(stem):
+        return None
+    known, name = source.metadata, cut(file.name)
+    if values.size == len(values) and len(values) > 1 and (np.diff(values.ravel()) > 0).all():
+        key = "state_times" if "state" in stem else "depth_times" if "depth" in stem else "times"
+        if getattr(known, key) is None and re.search(r"time|stamp|(^|_)ts?($|_)", stem):
+            says = f"{name} rises with the pictures and is not used; if it has their times, write '{key}: {name}'"
+            return Check("times", Verdict.DOUBTFUL, f"{says} into {FILE_NAME}")
+        return None
+    if values.ndim != 2 or source.streams.state:
+        return None
+    says = f"{name} has {values.shape[1]} numbers for every picture and is not used; if it is the state, write"
+    return Check("state", Verdict.DOUBTFUL, f"{says} 'state: {name}' into {FILE_NAME}")
 
 
 def _of_camera(source: "ParsedRecording", file: FoundFile) -> str | None:

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from filmed_scenes import looking
-from real_recordings import HEIGHT, INTRINSICS, STEPS, WIDTH, K, colors, counts, write_folder, write_yaml
-from test_ros_reader import Messages, Say, instant, write_bag
+from real_recordings import HEIGHT, INTRINSICS, STEPS, WIDTH, K, colors, counts, write_folder, write_png, write_yaml
+from test_ros_reader import Messages, Say, instant, say_camera, write_bag
 from test_situations_meaning import Capture, looked_at
 
 from flowlab.recordings.depth_unit_check import likely_unit
+from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_camera_info import rectified
+from flowlab.recordings.readers.tum import TUMReader
 
 BENT = [0.3, -0.1, 0.0, 0.0, 0.0]
 POSES = np.array([looking((0.3 - 0.02 * t, -0.9, 0.7)) for t in range(STEPS)])
@@ -212,6 +214,74 @@ def test_what_messages_say_of_a_camera(
     found, facts, checks = looked_at(capsys, bag)
     assert (found, checks[about][0]) == (code, verdict), (facts["problem"], checks[about])
     assert re.search(words, checks[about][1]), checks[about]
+
+
+@pytest.mark.parametrize(("unit", "verdict"), [(0.001, "ok"), (0.0001, "doubtful"), (0.02, "doubtful")])
+def test_a_stated_unit_is_doubted_where_no_camera_measures(
+    tmp_path: Path, capsys: Capture, unit: float, verdict: str
+) -> None:
+    code, _, checks = looked_at(capsys, write_folder(tmp_path / "r", depth_unit_m=unit))
+    assert (code, checks["depth unit"][0]) == (0, verdict), checks["depth unit"]
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [("rgbd_dataset_freiburg2_desk", True), ("uni-freiburg2", False), ("freiburg1_lab", False)],
+)
+def test_only_the_benchmarks_own_names_tell_its_cameras(tmp_path: Path, name: str, known: bool) -> None:
+    folder = tmp_path / name
+    for t in range(2):
+        write_png(folder / f"rgb/{t}.png", colors()[t])
+        write_png(folder / f"depth/{t}.png", counts()[t])
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").write_text("".join(f"{1.7e9 + t / 10:.6f} {kind}/{t}.png\n" for t in range(2)))
+    given = [metadata.intrinsics for _, metadata in TUMReader().read(folder, Metadata()).known]
+    assert any(given) == known
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("timestamps", 5.0 * np.arange(STEPS), "write 'times: timestamps.npy'"),
+        ("depth_ts", 0.1 + np.arange(STEPS), "write 'depth_times: depth_ts.npy'"),
+        ("ee_states", np.random.default_rng(0).normal(size=(STEPS, 7)), "write 'state: ee_states.npy'"),
+        ("observations", np.random.default_rng(0).normal(size=(STEPS, 3)), "write 'state: observations.npy'"),
+        ("weights", np.ones((STEPS + 9, 3)), ""),
+        ("rising", np.arange(STEPS), ""),
+    ],
+)
+def test_a_row_for_every_picture_is_asked_about(
+    tmp_path: Path, capsys: Capture, name: str, values: np.ndarray, words: str
+) -> None:
+    folder = write_folder(tmp_path / "r")
+    np.save(folder / f"{name}.npy", values)
+    code, facts, _ = looked_at(capsys, folder)
+    told = [c["says"] for c in facts["checks"] if c["verdict"] == "doubtful" and name in c["says"]]
+    assert (code, bool(told)) == (0, bool(words)), facts["checks"]
+    assert words in "".join(told)
+
+
+def test_arrays_that_may_all_be_one_thing_are_refused(tmp_path: Path, capsys: Capture) -> None:
+    arrays = {"img": colors(), "depth": counts(), "state": np.eye(STEPS), "qpos": np.eye(STEPS)}
+    write_yaml(tmp_path / "r.yaml", fps=10, depth_unit_m=0.001, intrinsics=INTRINSICS)
+    np.savez(tmp_path / "r.npz", **arrays)
+    assert looked_at(capsys, tmp_path / "r.npz")[0] == 0
+    np.savez(tmp_path / "r.npz", **{**arrays, "qpos": 2 * np.eye(STEPS)})
+    code, facts, _ = looked_at(capsys, tmp_path / "r.npz")
+    assert (code, "state, qpos may all be the state, and are not the same" in facts["problem"]) == (3, True)
+
+
+def test_topics_that_are_not_read_are_listed(tmp_path: Path, capsys: Capture) -> None:
+    def say_all(m: Messages, say: Say) -> None:
+        say_camera(m, say)
+        for t in range(STEPS):
+            now = instant(t)
+            say("/camera_pose", "geometry_msgs/msg/TransformStamped", now, m.transform("world", "camera", POSES[t]))
+
+    bag = write_bag(tmp_path / "r.bag", 1, say_all)
+    code, _, checks = looked_at(capsys, bag)
+    assert (code, checks["unused topics"][0]) == (0, "doubtful")
+    assert "'topics: {T_world_cam: /camera_pose}'" in checks["unused topics"][1]
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,7 @@ class ArraysReader:
             )
         if missing:
             raise DataError(f"{path}: has no array for {missing[0]}; it may be called {', '.join(NAMES[missing[0]])}")
+        _check_single(path, names)
         store = _Store(path, names)
         color, depth = store.load("color"), store.load("depth")
         assert color is not None
@@ -120,8 +121,27 @@ class ArraysReader:
 
 def _find(path: Path) -> dict[str, str]:
     """What arrays there are, by name; nothing is read of them."""
-    present = _members(path) if path.is_file() else {f.stem for f in path.glob("*.npy")}
+    present = _present(path)
     return {what: name for what, names in NAMES.items() for name in reversed(names) if name in present}
+
+
+def _present(path: Path) -> set[str]:
+    """Names of the arrays there are."""
+    return _members(path) if path.is_file() else {f.stem for f in path.glob("*.npy")}
+
+
+def _check_single(path: Path, used: dict[str, str]) -> None:
+    """Refuse several arrays that are called as one thing, unless they are the same."""
+    present = _present(path)
+    for what in ("color", "depth", "state", "action", "time", "intrinsics", "pose"):
+        several = [name for name in NAMES[what] if name in present]
+        if len(several) < 2:
+            continue
+        first, *others = (_Store(path, {what: name}).load(what) for name in several)
+        if not all(np.array_equal(first, other) for other in others):
+            raise DataError(f"{path}: {', '.join(several)} may all be the {what}, and are not the same; keep "
+                            f"one, or call the "
+                            "others otherwise")  # fmt: skip
 
 
 def _members(path: Path) -> set[str]:

@@ -15,6 +15,7 @@ from flowlab.recordings.readers.realsense import is_sdk_bag
 from flowlab.recordings.readers.ros_bag import BagIndex, RosBag
 from flowlab.recordings.readers.ros_cameras import find_calibration, find_unit, static_transforms
 from flowlab.recordings.readers.ros_messages import decode_image
+from flowlab.recordings.readers.ros_poses import TYPES as POSES
 from flowlab.recordings.readers.ros_poses import read_pose_topic
 from flowlab.recordings.readers.ros_samples import group_samples
 from flowlab.recordings.readers.ros_topics import IMAGES, JOINTS, ChosenTopics, choose_topics
@@ -51,7 +52,7 @@ class ROSReader:
         for what, topic in (("state", topics.state), ("action", topics.action)):
             robot[what], told = ((), []) if topic is None else streams[topic].samples(what)
             checks += told
-        checks += [*_unchosen(bag, topics), *_unread(bag)]
+        checks += [*_unchosen(bag, topics), *_unread(bag), *_unused(bag, topics)]
         poses = None
         if topics.T_world_cam is not None:
             of = streams[topics.T_world_cam]
@@ -79,6 +80,20 @@ def _unread(bag: RosBag) -> list[Check]:
     wanted = any(kind in why for why in bag.unread.values() for kind in (*IMAGES, JOINTS))
     says = f"{says}: not used, for the messages cannot be read"
     return [Check("unread topics", Verdict.DOUBTFUL if wanted else Verdict.OK, says)]
+
+
+def _unused(bag: RosBag, topics: ChosenTopics) -> list[Check]:
+    """The topics that nothing uses; a doubt where they hold poses, and there are no others."""
+    used = {*topics.all(), topics.color_info, topics.depth_info}
+    kinds = {topic: kind for topic, kind in sorted(bag.types().items()) if topic not in used}
+    says = ", ".join(f"{topic} ({kind.rpartition('/')[2]})" for topic, kind in kinds.items())
+    poses = [topic for topic, kind in kinds.items() if kind in POSES]
+    if poses and topics.state is None and topics.T_world_cam is None:
+        says = (f"{cut(', '.join(poses))} hold poses and are not used; if one is the state, or the pose of a "
+                f"camera that moves, "
+                f"write 'topics: {{state: {poses[0]}}}' or 'topics: {{T_world_cam: {poses[0]}}}'")  # fmt: skip
+        return [Check("unused topics", Verdict.DOUBTFUL, says)]
+    return [Check("unused topics", Verdict.OK, cut(says, 600) or "every topic is used")]
 
 
 def _unchosen(bag: RosBag, topics: ChosenTopics) -> list[Check]:

@@ -94,6 +94,8 @@ def intrinsics_of(info: Any, topic: str) -> Intrinsics | None:
     K, D, P = (_field(info, name) for name in "KDP")
     if K.size != 9 or not K[0] > 0:
         return None
+    if not (np.isfinite(K).all() and np.isfinite(D).all()):
+        raise SettingsError(f"the CameraInfo of {topic} holds what is no number; write 'intrinsics' of the pictures")
     if not rectified(topic)[0]:
         return _part(Intrinsics.from_matrix(K.reshape(3, 3), **distortion_of(info.distortion_model, D.tolist())), info)
     if P.size == 12 and P[0] > 0:

@@ -57,6 +57,10 @@ def _registered(
                 f"({_words(depth)}) than {topics.color_info} ({_words(color)}); choose another topic with "
                 "'topics: {depth: ...}', or give 'depth_intrinsics' and 'T_color_depth'")  # fmt: skip
         return True, Check("camera_info", Verdict.REFUSED, says)
+    if name is not None and camera_of(topics.color) != camera_of(topics.depth) and frames[0] != frames[1]:
+        says = (f"{topics.depth} is called {name}, but is of frame '{shown(frames[1])}' and {topics.color} of frame "
+                f"'{shown(frames[0])}': of two cameras, it seems; choose the topics of one with 'topics'")  # fmt: skip
+        return True, Check("camera_info", Verdict.DOUBTFUL, says)
     if name is not None:
         return True, Check("camera_info", Verdict.OK, f"{topics.depth} is registered to color, as its name says")
     if not frames[0] == frames[1] != "":
