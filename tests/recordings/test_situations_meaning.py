@@ -101,7 +101,7 @@ def test_a_simple_motion_is_no_clock() -> None:
     assert not find_clocks(np.stack([T, 5 + T, 9 + T], 1), (), T)  # all joints move alike
     assert not find_clocks(np.stack([0.9 * T, X[:, 0]], 1), (), T)
     assert not find_clocks(np.stack([T, X[:, 0]], 1), ("joint_1", "joint_2"), T)
-    (found,) = find_clocks(np.stack([T, X[:, 0]], 1), ("feld", "joint_2"), T)
+    (found,) = find_clocks(np.stack([T, X[:, 0]], 1), ("channel", "joint_2"), T)
     assert not found.certain
 
 

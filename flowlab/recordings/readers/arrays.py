@@ -137,8 +137,8 @@ def _check_single(path: Path, used: dict[str, str]) -> None:
         several = [name for name in NAMES[what] if name in present]
         if len(several) < 2:
             continue
-        first, *others = (_Store(path, {what: name}).load(what) for name in several)
-        if not all(np.array_equal(first, other) for other in others):
+        found = [array for name in several if (array := _Store(path, {what: name}).load(what)) is not None]
+        if not all(np.array_equal(found[0], other) for other in found[1:]):
             raise DataError(f"{path}: {', '.join(several)} may all be the {what}, and are not the same; keep "
                             f"one, or call the "
                             "others otherwise")  # fmt: skip
