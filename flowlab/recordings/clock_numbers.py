@@ -20,7 +20,7 @@ _TIMES = re.compile(
 """What names of times have in them."""
 _OF_ROBOTS = re.compile(
     r"joint|pos|vel|angle|grip|finger|wrist|elbow|shoulder|effort|torque|force|tcp|tool|eef|"
-    r"(?<![a-z])(roll|pitch|yaw|arm|[a-z]{1,2})[\W_]*\d*$|(^|/)\d+$"
+    r"(^|[/.])[a-z]{1,2}[\W_]*\d*$|(^|[/._])([rdqptv]?[xyzw]|[qj]|roll|pitch|yaw|arm)[\W_]*\d*$|(^|/)\d+$"
 )
 """What names of a robot's numbers have in them; these may, by chance, go on as a clock does."""
 

@@ -192,9 +192,9 @@ def filmed(tmp_path: Path, *, zoom: float = 1.0, bend: float = 0.0, far: float =
     ("how", "given", "code", "about", "verdict", "words"),
     [
         ({}, {}, 0, "intrinsics over time", "ok", "all messages of /cam/rgb/camera_info say the same"),
-        ({"zoom": 1.3}, {}, 3, "intrinsics over time", "refused", "from fx 30, .* to fx 39, "),
-        ({"zoom": 1.004}, {}, 0, "intrinsics over time", "doubtful", "to fx 30.12"),
-        ({"zoom": 1.3}, {"intrinsics": INTRINSICS}, 0, "intrinsics over time", "doubtful", "to fx 39"),
+        ({"zoom": 1.3}, {}, 3, "intrinsics over time", "refused", "from 32x24, fx 30, .* to 32x24, fx 39, "),
+        ({"zoom": 1.004}, {}, 0, "intrinsics over time", "doubtful", "to 32x24, fx 30.12"),
+        ({"zoom": 1.3}, {"intrinsics": INTRINSICS}, 0, "intrinsics over time", "doubtful", "to 32x24, fx 39"),
         ({"bend": 0.1, "name": "undistorted/image"}, {}, 0, "rectified", "assumed", "by the name: seen as P says"),
         ({"bend": 0.1, "name": "undistorted/image_raw"}, {}, 3, "rectified", "refused", "both raw and rectified"),
         ({"bend": 0.1, "name": "image"}, {}, 0, "rectified", "assumed", "taken as not rectified"),

@@ -101,8 +101,10 @@ def test_a_simple_motion_is_no_clock() -> None:
     assert not find_clocks(np.stack([T, 5 + T, 9 + T], 1), (), T)  # all joints move alike
     assert not find_clocks(np.stack([0.9 * T, X[:, 0]], 1), (), T)
     assert not find_clocks(np.stack([T, X[:, 0]], 1), ("joint_1", "joint_2"), T)
-    (found,) = find_clocks(np.stack([T, X[:, 0]], 1), ("channel", "joint_2"), T)
-    assert not found.certain
+    assert not find_clocks(np.stack([T, X[:, 0]], 1), ("left_x", "left_qw"), T)
+    for name, rate in (("channel", 1.0), ("counter_us", 1e6)):
+        (found,) = find_clocks(np.stack([rate * T, X[:, 0]], 1), (name, "joint_2"), T)
+        assert not found.certain
 
 
 # --- decimal commas -----------------------------------------------------------------------------------------

@@ -56,11 +56,19 @@ def _constant(info: str, found: Sequence[Intrinsics], given: Intrinsics | None, 
     apart = _apart(first, other)
     if apart <= _OTHER[0]:
         return [Check(f"{about} over time", Verdict.OK, f"all messages of {info} say the same")]
-    seen = [f"fx {camera.fx:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}" for camera in (first, other)]
+    seen = [_words(camera) for camera in (first, other)]
     says = (f"{info} changes in the recording, from {seen[0]} to {seen[1]}, as of a camera that zooms or "
             f"was started anew, or of two; cut it there, or write '{about}' if one holds for all pictures")  # fmt: skip
     refused = apart > _OTHER[1] and given is None
     return [Check(f"{about} over time", Verdict.REFUSED if refused else Verdict.DOUBTFUL, says)]
+
+
+def _words(camera: Intrinsics) -> str:
+    """A camera in a few numbers."""
+    lens = (
+        "no distortion" if not camera.distortion else f"distortion {', '.join(f'{d:.3g}' for d in camera.distortion)}"
+    )
+    return f"{camera.width}x{camera.height}, fx {camera.fx:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}, {lens}"
 
 
 def _apart(a: Intrinsics, b: Intrinsics) -> float:
