@@ -116,7 +116,8 @@ def check_inside(folder: Path, path: Path) -> None:
     Raises:
         DataError: ``path`` is somewhere else.
     """
-    if not path.resolve().is_relative_to(folder.resolve()):
+    real = Path(os.path.realpath(path))  # which is told of a circle of links, too, where Path.resolve fails
+    if not real.is_relative_to(os.path.realpath(folder)):
         raise DataError(f"{path}: is a link that leads out of {folder}, expected a folder; nothing is written there")
 
 

@@ -13,9 +13,10 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from flowlab.checksums import with_checksum, without_checksum
-from flowlab.errors import DataError, first_line
+from flowlab.errors import DataError, MissingFileError, first_line
 from flowlab.files import new_file
-from flowlab.untrusted import parse_json
+from flowlab.limits import MAX_WEIGHTS_BYTES
+from flowlab.untrusted import check_regular, parse_json
 
 _ABOUT = "flowlab"
 """Key under which a file of tensors says what it is."""
@@ -64,10 +65,11 @@ def metadata_of(file: Any, where: str, advice: str) -> dict[str, Any]:
 @contextmanager
 def understood(path: Path, advice: str) -> Iterator[None]:
     """Turns a failure to read weights into a sentence."""
-    if not path.exists():
-        raise DataError(f"{path}: there is no such checkpoint")
     try:
+        check_regular(path, MAX_WEIGHTS_BYTES)  # a pipe would be waited at for ever
         yield
+    except MissingFileError as error:
+        raise DataError(f"{path}: there is no such checkpoint") from error
     except DataError:
         raise
     except (KeyError, ValueError) as error:

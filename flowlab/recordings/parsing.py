@@ -91,7 +91,7 @@ class ParsedRecording:
         if not len(seen.color):
             first = f"; {seen.bad[0].name} {seen.bad[0].reason}" if seen.bad else ""
             raise DataError(f"{self.path}: none of {seen.looked_at} frames can be used{first}")
-        return make_frame_processor(
+        made = make_frame_processor(
             self.path,
             self.metadata,
             seen.color_size,
@@ -101,6 +101,7 @@ class ParsedRecording:
             write_to=self.write_to,
             median_counts=seen.median_counts,
         )
+        return made if seen.T_world_cam is None else replace(made, camera=made.camera.at(seen.T_world_cam[0]))
 
     def check_bad_frames(self, settings: RecordingSettings) -> None:
         """Raise :class:`DataError` where there are more bad frames than the settings allow."""

@@ -24,7 +24,7 @@ _SOON_S, _LATEST_S = 0.1, 6.0
 """How much later those are at least and at most [s]."""
 _FAR_PX = 0.04
 """Share of the width that the picture moves by in between."""
-_WIDTH = 320
+_WIDTH = 214
 _LEAST_SIDE = 24
 _ENOUGH = 0.05
 """Share of the pixels that two rows must both show."""

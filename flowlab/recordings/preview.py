@@ -61,6 +61,8 @@ class CloudPreview:
     """Where the state says that the gripper was; None where its numbers cannot be that."""
     gripper_names: str = ""
     """Which numbers of the state these are."""
+    camera_path_world: Float64[np.ndarray, "T 3"] | None = None
+    """Where a camera that moves is in every row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +147,8 @@ def _streams(source: ParsedRecording) -> Iterator[StreamPreview]:
         time_s = _since(streams, stream)
         skipped = time_s[seen.skipped] if name == "color" else None
         yield StreamPreview(name, time_s, find_gaps(time_s), time_s[seen.repeated[name]], skipped)
-    for samples in (*streams.state, *streams.action):
+    poses = () if streams.poses is None else (streams.poses,)
+    for samples in (*streams.state, *streams.action, *poses):
         time_s = _since(streams, samples)
         yield StreamPreview(samples.name, time_s, find_gaps(time_s))
 
@@ -162,7 +165,8 @@ def _cloud(source: ParsedRecording, processor: FrameProcessor | None) -> CloudPr
         v, u = np.nonzero(depth[::n, ::n])
         v, u = v * n, u * n
         xyz_world = processor.camera.unproject(np.stack([u, v], -1), depth[v, u])
-        return CloudPreview(xyz_world, rgb[v, u], processor.camera, *_gripper(source))
+        path = None if seen.T_world_cam is None else seen.T_world_cam[:, :3, 3]
+        return CloudPreview(xyz_world, rgb[v, u], processor.camera, *_gripper(source), path)
     return None
 
 

@@ -117,19 +117,19 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
     processor = source.frame_processor(settings)
     source.check_bad_frames(settings)
     raise_refused(path, source.checks)
-    rows, poses = source.rows(), source.frame_check.T_world_cam
+    rows = source.rows()
     success = np.zeros(len(rows.clock_s), bool)
     success[-1] = source.metadata.success
     recording = Recording(
         task=task,
         seed=seed,
-        camera=processor.camera if poses is None else processor.camera.at(poses[0]),
+        camera=processor.camera,
         time_s=rows.clock_s - rows.clock_s[0],
         state=rows.state,
         action=rows.action,
         success=success,
         extras=_extras(source, processor, rows),
-        T_world_cam=poses,
+        T_world_cam=source.frame_check.T_world_cam,
         path=source.path,
         streams=source.streams,
         processor=processor,

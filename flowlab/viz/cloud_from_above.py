@@ -107,7 +107,9 @@ def _draw_camera(axes: Axes, cloud: CloudPreview, up: Float64[np.ndarray, "3 3"]
         axes.plot([middle[0], end[0]], [middle[1], end[1]], color=PURPLE, linewidth=1.4, zorder=5)
     axes.plot(*middle[:2], "o", color=PURPLE, markersize=6, zorder=6)
     _label(axes, "camera", middle[:2], PURPLE, below_pt=6)
-    return np.concatenate([middle[None, :2], ends[:, :2]])
+    path = middle[None] if cloud.camera_path_world is None else cloud.camera_path_world @ up.T
+    axes.plot(*path[:, :2].T, color=PURPLE, linewidth=0.9, alpha=0.6, zorder=5)
+    return np.concatenate([path[:, :2], ends[:, :2]])
 
 
 def _draw_gripper(axes: Axes, path: Float64[np.ndarray, "T 3"], names: str) -> Float64[np.ndarray, "T 2"]:

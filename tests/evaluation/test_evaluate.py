@@ -319,6 +319,9 @@ def test_a_run_that_cannot_be_written_is_one_sentence(fdp: Path, tmp_path: Path,
     (run / PLACE).symlink_to(home / "file")
     assert refused(capsys, *asked)[0] == 3
     assert list(home.iterdir()) == []
+    (run / PLACE).unlink()
+    (run / PLACE).symlink_to((run / PLACE).name)
+    assert refused(capsys, *asked)[0] == 3
 
 
 @pytest.mark.parametrize(

@@ -226,6 +226,7 @@ def lose_a_tensor(path: Path) -> None:
         (lambda p: p.write_bytes(b"\x80\x04N."), "damaged"),
         (lambda p: save_file(load_file(p), p), "it does not tell its step"),
         (lose_a_tensor, "does not fit"),
+        (lambda p: (p.unlink(), os.mkfifo(p)), "is a device or a pipe, expected a file"),
     ],
 )
 def test_a_damaged_checkpoint_is_said_in_one_sentence(

@@ -20,6 +20,8 @@ from test_ros_reader import Messages, Say, instant, write_bag
 import flowlab
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import inverse
+from flowlab.recordings.parsing import RecordingSettings, parse_recording
+from flowlab.recordings.preview import preview_recording
 from flowlab.recordings.readers.plain import write_rgbd_recording
 from flowlab.records import Episode
 from flowlab.storage.checks import episode_problems
@@ -424,3 +426,12 @@ def test_stored_poses_are_validated(frames: Frames, tmp_path: Path, capsys: Capt
     (problem,) = episode_problems(e, flowlab.open_dataset(out).provenance)
     assert problem.array == "data/T_world_cam"
     assert "holds no rotation" in problem.what
+
+
+def test_the_sheet_shows_the_world_and_the_cameras_path(frames: Frames, tmp_path: Path) -> None:
+    path = put(tmp_path / "r", frames, POSES)
+    preview = preview_recording(path, RecordingSettings(), parse_recording(path, RecordingSettings()))
+    assert preview.cloud is not None
+    np.testing.assert_allclose(preview.cloud.camera_path_world, POSES[:, :3, 3])
+    assert np.abs(np.median(preview.cloud.xyz_world[:, 2])) < 0.15  # the table, and what stands on it
+    assert "T.npy" in [s.name for s in preview.streams]
