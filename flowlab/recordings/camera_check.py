@@ -14,6 +14,8 @@ _NORMALIZED = 10.0
 """A focal length of fewer pixels is not in pixels."""
 _OFF_AXIS = (0.1, 0.2)
 """A principal point this far from the middle, of width or height, is doubtful, and refused."""
+_CLOSE = 0.05
+"""A principal point this far from the middle is in it."""
 _UNEQUAL = (1.15, 2.5)
 """Where fx and fy differ by these factors they are doubtful, and refused."""
 _VIEW_DEG = ((25.0, 125.0), (6.0, 165.0))
@@ -53,17 +55,31 @@ def _faults(about: str, given: Intrinsics, size: _Size, write_to: str) -> Iterat
     if of != size:
         yield Verdict.REFUSED, _other_size(about, given, of, size, write_to)
         return
-    for fault in (_normalized(about, given, size), _off_axis(about, given, size), _swapped(about, given)):
-        if fault is not None:
-            yield fault[0], f"{fault[1]}; write into {write_to} those of these pictures: '{about}: {fault[2]}'"
-            return
+    yield from _likely_faults(about, given, size, write_to)
+
+
+def _likely_faults(about: str, given: Intrinsics, size: _Size, write_to: str) -> Iterator[tuple[Verdict, str]]:
+    """The worst of what speaks against the numbers themselves, the first of several."""
+    found = [
+        (fault[0], f"{fault[1]}; write into {write_to} those of these pictures: '{about}: {fault[2]}'")
+        for fault in (_normalized(about, given, size), _off_axis(about, given, size), _swapped(about, given))
+        if fault is not None
+    ]
+    view = _view(about, given, size, write_to)
+    found += [] if view is None else [view]
+    yield from [fault for fault in found if fault[0] is Verdict.REFUSED][:1] or found[:1]
+
+
+def _view(about: str, given: Intrinsics, size: _Size, write_to: str) -> tuple[Verdict, str] | None:
+    """A field of view that no lens has, or few."""
     width, height = _view_deg(given, size)
-    if given.lens is not Lens.FISHEYE:
-        for verdict, (low, high) in zip((Verdict.REFUSED, Verdict.DOUBTFUL), _VIEW_DEG[::-1], strict=True):
-            if not (low < width < high and low < height < high):
-                yield verdict, (f"fx {given.fx:g} and fy {given.fy:g} px make a field of view of {width:.0f} x "
-                                f"{height:.0f} degrees; correct '{about}' in {write_to}")  # fmt: skip
-                return
+    if given.lens is Lens.FISHEYE:
+        return None
+    for verdict, (low, high) in zip((Verdict.REFUSED, Verdict.DOUBTFUL), _VIEW_DEG[::-1], strict=True):
+        if not (low < width < high and low < height < high):
+            return verdict, (f"fx {given.fx:g} and fy {given.fy:g} px make a field of view of {width:.0f} x "
+                             f"{height:.0f} degrees; correct '{about}' in {write_to}")  # fmt: skip
+    return None
 
 
 _Fault = tuple[Verdict, str, str]
@@ -90,13 +106,31 @@ def _off_axis(about: str, given: Intrinsics, size: _Size) -> _Fault | None:
     half = given.model_copy(update={"fx": given.cx, "cx": given.fx})
     if given.cx > 0 and _is_central(half, size) and 1 / _UNEQUAL[0] < given.cx / given.fy < _UNEQUAL[0]:
         return Verdict.REFUSED, f"{says}: fx and cx look swapped", half.to_yaml()
+    crossed = given.model_copy(update={"cx": given.cy, "cy": given.cx})
+    if _is_central(crossed, size, _CLOSE):
+        return Verdict.REFUSED, f"{says}: cx and cy look swapped", crossed.to_yaml()
     of = min(_SIZES, key=lambda s: abs(given.cx / s[0] - 0.5) + abs(given.cy / s[1] - 0.5))
     verdict = Verdict.REFUSED if off > _OFF_AXIS[1] else Verdict.DOUBTFUL
+    whole = _whole(given, size)
+    if whole is not None:
+        says = f"{says}, as of the same pictures in {whole[0]}x{whole[1]}"
+        return Verdict.REFUSED, says, _scaled(given, whole, size).to_yaml()
     if of == size or not _is_central(given, of, 0.06):
         hint = given.model_copy(update={"width": size[0], "height": size[1], "cropped": True})
         return verdict, f"{says}, as of a part cut out of larger ones ('cropped: true')", hint.to_yaml()
     says = f"{says}, as of pictures of {of[0]}x{of[1]}"
     return verdict, says, resized(given, of, size).to_yaml()
+
+
+def _whole(given: Intrinsics, size: _Size) -> _Size | None:
+    """The size in which pictures of this shape would have the principal point in the middle, where that is another."""
+    factors = [(given.cx + 0.5) / (size[0] / 2), (given.cy + 0.5) / (size[1] / 2)]
+    factor = sum(factors) / 2
+    factor = round(4 * factor) / 4 if abs(round(4 * factor) / (4 * factor) - 1) < _CLOSE / 2 else factor
+    if min(factors) <= 0 or abs(factors[0] / factors[1] - 1) > 2 * _CLOSE or abs(factor - 1) <= 2 * _OFF_AXIS[0]:
+        return None
+    whole = round(size[0] * factor), round(size[1] * factor)
+    return whole if 10 * max(given.fx, given.fy) > max(whole) else None
 
 
 def _swapped(about: str, given: Intrinsics) -> _Fault | None:

@@ -14,6 +14,7 @@ from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
 from flowlab.recordings.checking import check_recording
+from flowlab.recordings.chosen_columns import with_chosen_columns
 from flowlab.recordings.clock import put_on_one_clock
 from flowlab.recordings.content import without_saturated
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
@@ -136,7 +137,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     reader = choose_reader(path, settings.reader)
     given = list(_given(path, settings))
     said = combine(given)[0]
-    streams = read_streams(reader, path, said)
+    streams = with_chosen_columns(path, read_streams(reader, path, said), said)
     for stream in (streams.color, streams.depth):
         if not len(stream):
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
