@@ -99,20 +99,15 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
 
 
 def _of_rows(source: "ParsedRecording", file: FoundFile) -> Check | None:
-    """A doubt about a file with a time, or with numbers, for every picture; None where it has neither."""
-    values, stem = _values(file.path), Path(file.name).stem.lower()
+    """A doubt about a file with numbers for every picture, which may be the robot's; None where it has none."""
+    values = _values(file.path)
     steps = {len(source.streams.color), len(source.streams.depth)}
-    if values is None or values.ndim not in (1, 2) or len(values) not in steps or called_poses(stem):
+    if values is None or values.ndim != 2 or len(values) not in steps or called_poses(Path(file.name).stem.lower()):
         return None
-    known, name = source.metadata, cut(file.name)
-    if values.size == len(values) and len(values) > 1 and (np.diff(values.ravel()) > 0).all():
-        key = "state_times" if "state" in stem else "depth_times" if "depth" in stem else "times"
-        if getattr(known, key) is None and re.search(r"time|stamp|(^|_)ts?($|_)", stem):
-            says = f"{name} rises with the pictures and is not used; if it has their times, write '{key}: {name}'"
-            return Check("times", Verdict.DOUBTFUL, f"{says} into {FILE_NAME}")
+    rises = values.shape[1] == 1 and len(values) > 1 and (np.diff(values[:, 0]) > 0).all()
+    if source.streams.state or rises:  # as times do, which are compared with those that are used
         return None
-    if values.ndim != 2 or source.streams.state:
-        return None
+    name = cut(file.name)
     says = f"{name} has {values.shape[1]} numbers for every picture and is not used; if it is the state, write"
     return Check("state", Verdict.DOUBTFUL, f"{says} 'state: {name}' into {FILE_NAME}")
 
