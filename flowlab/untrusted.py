@@ -72,7 +72,8 @@ def parse_json(text: str | bytes, where: str, advice: str = "") -> Any:
     advice = f"; {advice}" if advice else ""
     try:
         values = json.loads(text)
-        if _depth(values) > MAX_NESTING:
+        opened = sum(map(text.count, (b"[", b"{") if isinstance(text, bytes) else ("[", "{")))  # type: ignore[arg-type]
+        if opened > MAX_NESTING and _depth(values) > MAX_NESTING:
             raise RecursionError
     except RecursionError as error:
         raise DataError(f"{where}: is nested too deep{advice}") from error

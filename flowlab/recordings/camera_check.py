@@ -141,9 +141,9 @@ def _off_axis(given: Intrinsics, size: _Size) -> _Fault | None:
     if of is None:
         says += ", as of a part cut out of larger ones; if they are that, add 'cropped: true', else"
         return verdict, says, "{fx: ..., fy: ..., cx: ..., cy: ...}"
-    if _same_shape(of, size):
-        verdict = Verdict.REFUSED
-    return verdict, f"{says}, as of pictures of {of[0]}x{of[1]};", resized(given, of, size).to_yaml()
+    whole = _same_shape(of, size)
+    says = f"{says}, as of {'the same pictures in' if whole else 'pictures of'} {of[0]}x{of[1]};"
+    return Verdict.REFUSED if whole else verdict, says, resized(given, of, size).to_yaml()
 
 
 def _is_usual(given: Intrinsics, size: _Size) -> bool:

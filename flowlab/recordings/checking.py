@@ -7,8 +7,10 @@ from flowlab.recordings.camera_check import check_camera
 from flowlab.recordings.depth_unit_check import check_depth_unit
 from flowlab.recordings.left_out import check_widths_known, find_left_out
 from flowlab.recordings.motion_check import check_motion
+from flowlab.recordings.number_check import check_numbers
 from flowlab.recordings.pose_check import check_poses_fit
 from flowlab.recordings.registration_check import check_registration
+from flowlab.recordings.unused_times import check_unused_times
 from flowlab.recordings.verdicts import Check
 from flowlab.recordings.world_check import check_world
 
@@ -20,7 +22,9 @@ def check_recording(source: "ParsedRecording") -> Iterator[Check]:
     """What is looked at in a recording whose layout is understood, and what came of it."""
     yield from _geometry(source)
     yield from check_widths_known(source)
+    yield from check_numbers(source)
     yield from find_left_out(source)
+    yield from check_unused_times(source)
 
 
 def _geometry(source: "ParsedRecording") -> Iterator[Check]:

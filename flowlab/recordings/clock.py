@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
+from flowlab.recordings.dates import check_no_dates
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.numbering import check_numbers
-from flowlab.recordings.record_times import choose_clock
+from flowlab.recordings.record_times import choose_clock, was_set_back
 from flowlab.recordings.stamps import SECONDS, Timing, UnclearStamps, Unit, decide_sample_unit, decide_unit
 from flowlab.recordings.sync import find_gaps, sampling_rate
 from flowlab.recordings.verdicts import Check, Verdict
@@ -54,12 +55,16 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
             says what to write.
     """
     _check_said(streams, known)
-    named = dict(_named(streams, known))
-    recorded, checks = choose_clock({n: (s.time_s + off, s.timing) for n, (s, off) in named.items()}, known)
+    stamped = {n: (s.time_s + (getattr(known, key, 0) or 0), s.timing, key) for n, s, key in _named(streams)}
+    recorded, checks = choose_clock(stamped, known)
     color, depth = (_in_order(s, name, recorded) for s, name in ((streams.color, "color"), (streams.depth, "depth")))
     state, action = (
         tuple(_in_order(s, s.name, recorded) for s in samples) for samples in (streams.state, streams.action)
     )
+    for time_s, timing in ((s.time_s, s.timing) for s in (color, depth)):
+        check_no_dates(time_s, timing)
+    for sample in (*state, *action):
+        check_no_dates(sample.time_s, sample.timing)
     units = [decide_unit(s.time_s, s.timing, fps=known.fps, stated=known.time_unit) for s in (color, depth)]
     if "frames" in units and units[0] != units[1]:
         raise UnclearStamps(
@@ -86,14 +91,14 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
     return replace(timed, checks=(*streams.checks, said, *checks, *_step_checks(timed)))
 
 
-def _named(streams: Streams, known: Metadata) -> Iterator[tuple[str, tuple[ImageStream | SampleStream, float]]]:
-    """Every stream by what it is called, with what the user adds to its stamps [s]."""
-    yield "color", (streams.color, 0.0)
-    yield "depth", (streams.depth, known.depth_offset_s or 0.0)
+def _named(streams: Streams) -> Iterator[tuple[str, ImageStream | SampleStream, str]]:
+    """Every stream, what it is called, and the key with which the user says what to add to its times."""
+    yield "color", streams.color, ""
+    yield "depth", streams.depth, "depth_offset_s"
     for s in (*streams.state, *streams.action):
-        yield s.name, (s, known.state_offset_s or 0.0)
+        yield s.name, s, "state_offset_s"
     if streams.poses is not None:
-        yield streams.poses.name, (streams.poses, known.T_world_cam_offset_s or 0.0)
+        yield streams.poses.name, streams.poses, "T_world_cam_offset_s"
 
 
 def _check_said(streams: Streams, known: Metadata) -> None:
@@ -119,7 +124,12 @@ def _in_order(stream: AnyStream, name: str, recorded: bool) -> AnyStream:
     order = np.argsort(stamps, kind="stable")
     steps = np.diff(stamps[order])
     usual = np.median(steps)
-    if timing.overtaking and steps.min() >= _IN_ORDER * usual and -np.diff(stamps).min() <= _OVERTAKEN * usual:
+    overtaken = (
+        timing.overtaking
+        and -np.diff(stamps).min() <= _OVERTAKEN * usual
+        and (timing.recorded_s is None or not was_set_back(stamps, timing.recorded_s))
+    )
+    if overtaken and steps.min() >= _IN_ORDER * usual:
         return _reordered(replace(stream, time_s=stamps), order)
     at = int(back[0])
     unit = "" if timing.unit is None else f" {timing.unit}"
@@ -189,10 +199,8 @@ def _number_checks(
 def _check_overlap(streams: Streams) -> None:
     """Refuse streams that were not recorded at the same time as the pictures."""
     color = streams.color.time_s
-    every: list[tuple[str, np.ndarray, str]] = [("depth", streams.depth.time_s, "depth_offset_s")]
-    every += [(s.name, s.time_s, "state_offset_s") for s in (*streams.state, *streams.action)]
-    every += [] if streams.poses is None else [(streams.poses.name, streams.poses.time_s, "T_world_cam_offset_s")]
-    for name, time_s, key in every:
+    for name, stream, key in _named(streams):
+        time_s = stream.time_s
         if len(time_s) and max(time_s[0] - color[-1], color[0] - time_s[-1]) > _APART_S:
             raise UnclearStamps(
                 f"color lies between {color[0]:.15g} and {color[-1]:.15g} s, and {name} between {time_s[0]:.15g} and "
@@ -205,7 +213,7 @@ def _clock_words(streams: Streams, units: Sequence[str], known: Metadata) -> tup
     """In which unit the stamps of pictures are, and how that is known."""
     found, verdict = [], Verdict.OK
     for name, stream, unit in (("color", streams.color, units[0]), ("depth", streams.depth, units[1])):
-        how = f"as 'fps: {known.fps:g}' says" if unit == "frames" else "as the layout says"
+        how = f"with 'fps: {known.fps:g}'" if unit == "frames" else "as the layout says"
         if unit != "frames" and stream.timing.unit is None:
             how = "as 'time_unit' says" if known.time_unit else "by how they step and where they begin"
             verdict = verdict if unit == "s" or known.time_unit else Verdict.ASSUMED

@@ -13,11 +13,14 @@ if TYPE_CHECKING:
 
 CUSTOM = "the custom of "
 """Begins the origin of what no file says."""
-_UNITS = (1.0, 0.001, 0.00025, 0.0001, 0.0002)
+_UNITS = (1.0, 0.001, 0.0001, 0.00025, 0.0002)
+"""Of depth pictures, the most usual first [m]."""
 _POSSIBLE_M = (0.02, 100.0)
 """The median depth of a recording lies between these [m]."""
 _WORKSPACE_M = (0.15, 5.0)
 """A camera that sees a robot at work has its median depth between these [m]."""
+_FAR_M = 3.0
+"""Beyond this [m] it is unusual that far."""
 _SENSED_M = (0.15, 10.0)
 """Where depth cameras measure [m]."""
 _MOST = 0.9
@@ -29,9 +32,10 @@ _VARIED = 50
 
 def likely_unit(median_counts: float) -> str:
     """The unit that would put readings into a workspace, as what to write."""
-    usual = (1.0, 0.001, 0.0001)
-    likely = next((u for u in usual if _POSSIBLE_M[0] < median_counts * u < _WORKSPACE_M[1]), 0.001)
-    return f"'depth_unit_m: {likely}' would make that {median_counts * likely:.3g} m"
+    likely = next((u for u in _UNITS if _WORKSPACE_M[0] < median_counts * u < _FAR_M), None)
+    if likely is None:
+        return "no unit that is usual would make that a robot's workspace"
+    return f"'depth_unit_m: {likely:g}' would make that {median_counts * likely:.3g} m"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +77,7 @@ def check_depth_unit(source: "ParsedRecording") -> Iterator[Check]:
     says = f"{unit:g} m a count, from {origin}{_scene(unit, readings)}{why}"
     if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL):
         says += f"; write 'depth_unit_m' into {source.write_to}"
-        if not _WORKSPACE_M[0] < unit * readings.median < _WORKSPACE_M[1]:
+        if not _WORKSPACE_M[0] < unit * readings.median < _FAR_M:
             says += f" ({likely_unit(readings.median)})"
     yield Check("depth unit", verdict, says)
 
@@ -108,9 +112,15 @@ def _judged(unit: float, readings: _Readings, custom: bool) -> tuple[Verdict, st
         return Verdict.REFUSED, ", which cannot be"
     likely = _WORKSPACE_M[0] < median < _WORKSPACE_M[1]
     if not custom:
-        return (Verdict.OK, "") if likely or median < _SENSED_M[1] else (Verdict.DOUBTFUL, ", far for a depth camera")
+        if not _SENSED_M[0] < median < _SENSED_M[1]:
+            return Verdict.DOUBTFUL, f", {'near' if median < 1 else 'far'} for a depth camera"
+        return Verdict.OK, ""
     if not likely or high > 2 * _SENSED_M[1]:
         return Verdict.REFUSED, ", which is not a robot's workspace, and no file says that unit"
+    if median > _FAR_M:
+        smaller = unit / 10 * readings.median
+        return Verdict.DOUBTFUL, (f", far for a robot's workspace, and no file says that unit: a tenth of it, as some "
+                                  f"cameras have, would make the median {smaller:.3g} m")  # fmt: skip
     if readings.step >= 5 and unit * readings.step > 0.004:
         return Verdict.DOUBTFUL, ", coarser than depth cameras are: the counts may be of a smaller unit"
     return Verdict.ASSUMED, ""

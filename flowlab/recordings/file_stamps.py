@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from flowlab.recordings.dates import dates_in_names
 from flowlab.recordings.stamps import EPOCH_S, SECONDS, Timing, UnclearStamps
 from flowlab.text import shown
 
@@ -30,11 +31,14 @@ def read_names(files: Sequence[Path], source: str) -> tuple[list[Path], Float64[
     Raises:
         UnclearStamps: There is no such number, or several that change.
     """
-    texts = _changing(files, source)
+    dates = dates_in_names([f.stem for f in files])
+    texts = dates or _changing(files, source)
     _check_fractions(texts, source)
     values = np.array([float(t) for t in texts])
     order = np.argsort(values, kind="stable")
     integers = not any("." in t for t in texts)
+    if dates is not None:
+        return [files[i] for i in order], values[order], Timing(f"the dates and times in {source}", "s", names=True)
     return [files[i] for i in order], values[order], Timing(source, unit=None, integers=integers, names=True)
 
 

@@ -1,17 +1,18 @@
 """The first pass over a recording: which frames make rows, and which are bad, by name and reason."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
-from flowlab.recordings.content import PictureDigest, digest, find_repeats, motion_checks, repeated_pictures
+from flowlab.recordings.content import PictureDigest, digest, motion_checks, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.poses import check_known, poses_at
+from flowlab.recordings.repeats import find_repeats
 from flowlab.recordings.sync import nearest_sample, sampling_rate
 from flowlab.recordings.verdicts import Check
 
@@ -80,15 +81,15 @@ def check_frames(
     max_sync_s: float,
     max_state_s: float,
     pose_gap_s: float = 0.0,
-    stated: Sequence[str] = (),
+    stated: Mapping[str, float] | None = None,
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
     A frame is bad where its color or depth picture cannot be decoded, has another size than most, or no
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
     an interval; where no poses of a camera that moves are around it that are at most ``pose_gap_s`` apart; and where
-    its time does not lie after the frame before. ``stated`` are the streams of which the user
-    says how they belong to color.
+    its time does not lie after the frame before. ``stated`` is what the user has added to
+    the times of a stream.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
@@ -128,7 +129,8 @@ def check_frames(
     digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
-    checks = (repeats, *motion_checks(streams, digests[0], digests[1], stated))
+    told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
+    checks = (repeats, *motion_checks(streams, told[0], told[1], stated or {}))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)

@@ -88,7 +88,7 @@ class Intrinsics(FiniteSettings):
         return "{" + ", ".join(f"{k}: {_plain(values[k])}" for k in dict.fromkeys(order)) + "}"
 
 
-def distortion_of(model: str, coefficients: Sequence[float]) -> dict[str, Any]:
+def distortion_of(model: str | None, coefficients: Sequence[float]) -> dict[str, Any]:
     """The keys of a distortion, filled up with zeros to a number of coefficients that a model has; none for none."""
     found = [float(x) for x in coefficients]
     if not any(found):

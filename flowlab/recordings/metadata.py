@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from flowlab.config import Settings
 from flowlab.errors import DataError, unknown_name
 from flowlab.recordings.intrinsics import FiniteSettings, Intrinsics
-from flowlab.recordings.stamps import Unit
+from flowlab.recordings.stamps import StatedUnit
 from flowlab.text import cut, is_path_inside, shown
 from flowlab.untrusted import read_yaml
 
@@ -69,7 +69,7 @@ class Metadata(FiniteSettings):
     """File with the time of every color picture [s], one a line; of the depth pictures too without ``depth_times``."""
     depth_times: PathInside | None = None
     """File with the time of every depth picture [s]."""
-    time_unit: Unit | None = None
+    time_unit: StatedUnit | None = None
     """Unit of times in names, lists and files, where it is not clear: s, ms, us or ns."""
     clock: Literal["stamps", "recorded"] | None = None
     """Which times of messages to take, where their stamps and the times of recording do not agree."""

@@ -36,13 +36,13 @@ class Motion:
         return cls(name, time_s[1:] - step / 2, change / np.maximum(step, 1e-6))
 
 
-def check_motion(pictures: Motion, other: Motion, stated: bool) -> Check:
+def check_motion(pictures: Motion, other: Motion, stated: float | None) -> Check:
     """Whether another stream moves when the color pictures do. The offset is only reported, never applied.
 
     Args:
         pictures: Of the color pictures.
         other: Of the depth pictures, or of the robot.
-        stated: Whether the user says how the two belong together.
+        stated: What the user has added to the times of the other [s]; None where nothing was said.
     """
     about = f"motion of {other.name}"
     found = _offset(pictures, other)
@@ -55,9 +55,11 @@ def check_motion(pictures: Motion, other: Motion, stated: bool) -> Check:
         return Check(about, Verdict.OK, f"goes with that of color (correlation {like:.2f})")
     when = "after" if offset_s > 0 else "before"
     says = f"{abs(offset_s):.2f} s {when} that of color (correlation {like:.2f}, {like - margin:.2f} without it)"
-    if stated:
-        return Check(about, Verdict.ASSUMED, f"{says}; the offset that is written is taken")
     key = "depth_offset_s" if other.name == "depth" else "state_offset_s"
+    if stated is not None:
+        says += f", with '{key}: {stated:g}' added, which is taken as it is written"
+        verdict = Verdict.DOUBTFUL if stated else Verdict.ASSUMED  # 0 is the answer to what is asked below
+        return Check(about, verdict, f"{says}; '{key}: {stated - offset_s:.3g}' would make them go together")
     sure = like >= _SURE[0] and margin >= _SURE[1] and other.name == "depth"
     write = f"if their clocks differ, write '{key}: {-offset_s:.3g}', else '{key}: 0'"
     return Check(about, Verdict.REFUSED if sure else Verdict.DOUBTFUL, f"{says}; {write}")

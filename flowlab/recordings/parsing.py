@@ -14,6 +14,7 @@ from flowlab.config import Settings
 from flowlab.errors import DataError
 from flowlab.recordings.base import Reader, Streams, choose_reader, read_streams
 from flowlab.recordings.checking import check_recording
+from flowlab.recordings.chosen_columns import with_chosen_columns
 from flowlab.recordings.clock import put_on_one_clock
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
@@ -136,7 +137,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
     reader = choose_reader(path, settings.reader)
     given = list(_given(path, settings))
     said = combine(given)[0]
-    streams = read_streams(reader, path, said)
+    streams = with_chosen_columns(path, read_streams(reader, path, said), said)
     for stream in (streams.color, streams.depth):
         if not len(stream):
             raise DataError(f"{path}: has no {'color' if stream is streams.color else 'depth'} pictures")
@@ -153,7 +154,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         max_sync_s=settings.max_sync_s,
         max_state_s=settings.max_state_s,
         pose_gap_s=most_apart_s(streams.color, metadata.T_world_cam_gap_s),
-        stated=[name for name in ("depth", "state") if getattr(metadata, f"{name}_offset_s") is not None],
+        stated={s: off for s in ("depth", "state") if (off := getattr(metadata, f"{s}_offset_s")) is not None},
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
 

@@ -10,10 +10,11 @@ from flowlab.errors import DataError
 from flowlab.geometry.camera import pose_fault
 from flowlab.geometry.transforms import rigid
 from flowlab.recordings.base import ImageStream, SampleStream
+from flowlab.recordings.columns import base_and_unit
 from flowlab.recordings.sample_files import check_times, load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.sync import GAP, sampling_rate
-from flowlab.recordings.tables import SampleTable, base_and_unit, read_table
+from flowlab.recordings.tables import SampleTable, read_table
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 

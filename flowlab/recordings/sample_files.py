@@ -8,8 +8,9 @@ from jaxtyping import Float32, Float64, Num
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream
+from flowlab.recordings.columns import base_and_unit, find_columns
 from flowlab.recordings.stamps import Timing, rough_seconds
-from flowlab.recordings.tables import base_and_unit, find_columns, read_table
+from flowlab.recordings.tables import read_table
 
 
 def load_times(path: Path) -> tuple[Float64[np.ndarray, "N"], Timing]:

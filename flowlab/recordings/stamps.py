@@ -1,6 +1,6 @@
 """The unit of stamps: stated by a standard or by the user, else decided by evidence, else asked for."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,11 +10,20 @@ from jaxtyping import Float64
 from flowlab.errors import DataError
 
 Unit = Literal["s", "ms", "us", "ns"]
+StatedUnit = Literal["s", "ms", "us", "ns", "frames"]
+"""What the user may say: also that numbers are those of frames."""
 SECONDS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 EPOCH_S = (1e9, 4e9)
 """Stamps that count from 1970 lie between these, the years 2001 and 2096 [s]."""
 PICTURE_STEP_S = (1 / 240, 10.0)
 """What may lie between two pictures of a camera [s]."""
+_USUAL_STEP_S = {"s": 0.26, "ms": 0.26, "us": 0.105, "ns": 0.105}
+"""Longer steps are asked about where nothing but the step tells the unit: stamps may count ticks, of 100 ns or of
+90 kHz, which would be slow pictures in the next unit."""
+_LONGEST_S = EPOCH_S[1]
+"""Stamps that count more, from whatever instant, are in another unit."""
+_SAME = 0.02
+"""Steps that are all whole multiples of one may be numbers of kept frames, unless a unit gives the rate as exactly."""
 SAMPLE_STEP_S = (1 / 4000, 10.0)
 """What may lie between two samples of a robot [s]."""
 LARGEST_COUNT = 10
@@ -51,7 +60,7 @@ IN_SECONDS = Timing()
 
 
 def decide_unit(
-    stamps: Float64[np.ndarray, "N"], timing: Timing, *, fps: float | None, stated: Unit | None
+    stamps: Float64[np.ndarray, "N"], timing: Timing, *, fps: float | None, stated: StatedUnit | None
 ) -> Unit | Literal["frames"]:
     """The unit of the stamps of pictures, or that they number frames.
 
@@ -67,8 +76,11 @@ def decide_unit(
     step = _step(stamps)
     if timing.unit is not None or stated is not None:
         unit: Unit | Literal["frames"] = timing.unit or stated or "s"
+        if unit == "frames" and (fps is None or not timing.integers):
+            why = "'fps' is not" if fps is None else f"{timing.source} are no whole numbers"
+            raise UnclearStamps(f"'time_unit: frames' is said, but {why}; {_write(fps, False)}")
     else:
-        unit = epoch_unit(stamps) or _by_step(step, timing, fps)
+        unit = epoch_unit(stamps) or _by_step(stamps, timing, fps)
     if unit != "frames":
         _check_step(step, unit, timing, PICTURE_STEP_S)
         _check_rate(step, unit, timing, fps)
@@ -103,32 +115,66 @@ def _units(step: float, bounds: tuple[float, float]) -> list[Unit]:
     return [unit for unit, s in SECONDS.items() if bounds[0] * 0.999 <= step * s <= bounds[1]]  # type: ignore[misc]
 
 
-def _by_step(step: float, timing: Timing, fps: float | None) -> Unit | Literal["frames"]:
+def _by_step(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None) -> Unit | Literal["frames"]:
     """The unit in which a step is plausible, and agrees with ``fps``."""
+    step = _step(stamps)
     numbers = timing.integers and not step > LARGEST_COUNT
-    units: list[Unit | Literal["frames"]] = [*_units(step, PICTURE_STEP_S)]
+    units: list[Unit | Literal["frames"]] = [
+        u for u in _units(step, PICTURE_STEP_S) if np.max(np.abs(stamps)) * SECONDS[u] <= _LONGEST_S
+    ]
     if fps is not None:
-        units = [u for u in units if _agree(1 / (step * SECONDS[u]), fps)]
+        kept = timing.integers and step > LARGEST_COUNT and _is_even(stamps, step)
+        within = _SAME if kept else RATE_TOLERANCE
+        units = [u for u in units if _agree(1 / (step * SECONDS[u]), fps, within)]
         # Where frame numbers over fps and a unit come to the same, it does not matter which they are.
         units = ["frames", *(u for u in units if not _agree(SECONDS[u], 1 / fps))] if numbers else units
     elif numbers or (timing.names and timing.integers and timing.custom is None):
         units = ["frames", *units]
     elif timing.custom in units:
         units = [timing.custom]
-    if len(units) == 1 and (units != ["frames"] or fps is not None):
+    sure = fps is not None or (units != ["frames"] and all(_is_usual(step, u) for u in units))
+    if len(units) == 1 and sure:
         return units[0]
+    raise UnclearStamps(_unclear(stamps, timing, fps, units))
+
+
+def _is_usual(step: float, unit: str) -> bool:
+    """Whether pictures are taken so often that nothing but the unit is needed to believe it."""
+    return unit in _USUAL_STEP_S and step * SECONDS[unit] <= _USUAL_STEP_S[unit]
+
+
+def _is_even(stamps: Float64[np.ndarray, "N"], step: float) -> bool:
+    """Whether all steps are whole multiples of the usual one."""
+    return bool(np.all(np.diff(stamps) % step == 0))
+
+
+def _unclear(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None, units: Sequence[str]) -> str:
+    """Why the unit of stamps is not clear, and what to write."""
+    step = _step(stamps)
     found = f"{timing.source} step by {step:g}{'' if fps is None else f' where fps is {fps:g}'}"
-    if not units:
-        raise UnclearStamps(f"{found}: no plausible time in {_or(SECONDS)}, and no numbers of frames; {_write(fps)}")
-    raise UnclearStamps(f"when the pictures were taken is not known: {found} and may be {_or(units)}; {_write(fps)}")
+    rates = ["numbers of frames"] if "frames" in units else []
+    if fps is not None and timing.integers and not rates and step <= PICTURE_STEP_S[1] * fps:
+        rates = [f"numbers of frames, of which every {step:g}th was kept ({fps / step:.3g} pictures a second)"]
+    kept = bool(rates) and fps is not None
+    rates += [f"{u} ({1 / (step * SECONDS[u]):.3g} pictures a second)" for u in units if u != "frames"]
+    write = _write(fps, kept)
+    if not rates:
+        none = f"no plausible time in {_or(SECONDS)}, and no numbers of frames"
+        return f"{found}: {none}; they may count ticks; {write}"
+    ticks = "" if fps is not None or "frames" in units or len(units) > 1 else ", or ticks of another length"
+    return f"when the pictures were taken is not known: {found} and may be {' or '.join(rates)}{ticks}; {write}"
 
 
 def _check_step(step: float, unit: str, timing: Timing, bounds: tuple[float, float]) -> None:
     """Refuse a step that no camera has."""
     took = step * SECONDS[unit]
     if np.isfinite(took) and not bounds[0] * 0.999 <= took <= bounds[1]:
-        likely = [u for u in _units(step, bounds) if u != unit]
-        write = f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s" if likely else _write(1)
+        likely = [u for u in _units(step, bounds) if u != unit and _is_usual(step, u)]
+        write = (
+            f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s"
+            if likely
+            else _write(1, False)
+        )
         raise UnclearStamps(
             f"{timing.source} step by {took:.3g} s if they are in {unit}, expected {bounds[0]:.2g} to {bounds[1]:g} s "
             f"between pictures; {write}"
@@ -146,15 +192,17 @@ def _check_rate(step: float, unit: str, timing: Timing, fps: float | None) -> No
 
 
 def decide_sample_unit(
-    stamps: Float64[np.ndarray, "N"], timing: Timing, pictures_s: Float64[np.ndarray, "F"], stated: Unit | None
+    stamps: Float64[np.ndarray, "N"], timing: Timing, pictures_s: Float64[np.ndarray, "F"], stated: StatedUnit | None
 ) -> Unit:
     """The unit of the stamps of samples: the one in which they lie where the pictures do.
 
     Raises:
         UnclearStamps: None does, or several do.
     """
-    if timing.unit is not None or stated is not None:
-        return timing.unit or stated or "s"
+    if timing.unit is not None:
+        return timing.unit
+    if stated is not None and stated != "frames":
+        return stated
     if (epoch := epoch_unit(stamps)) is not None:
         return epoch
     step = _step(stamps)
@@ -171,9 +219,9 @@ def _covered(time_s: Float64[np.ndarray, "N"], pictures_s: Float64[np.ndarray, "
     return float(both / max(np.ptp(time_s), np.ptp(pictures_s), 1e-9))
 
 
-def _agree(rate: float, fps: float) -> bool:
+def _agree(rate: float, fps: float, within: float = RATE_TOLERANCE) -> bool:
     """Whether two rates are the same, roughly."""
-    return abs(rate / fps - 1) <= RATE_TOLERANCE
+    return abs(rate / fps - 1) <= within
 
 
 def _or(units: Iterable[str]) -> str:
@@ -181,7 +229,8 @@ def _or(units: Iterable[str]) -> str:
     return " or ".join("numbers of frames" if u == "frames" else u for u in units)
 
 
-def _write(fps: float | None) -> str:
+def _write(fps: float | None, kept: bool) -> str:
     """What to write where it is not clear."""
-    frames = "" if fps is not None else "'fps: 30' where they number frames, or "
+    frames = "'fps: 30' where they number frames, or " if fps is None else ""
+    frames = "'time_unit: frames' where they number frames, or " if kept else frames
     return f"write {frames}'time_unit: ms' for their unit (s, ms, us or ns), or give 'times', a file with them"

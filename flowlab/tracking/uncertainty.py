@@ -35,9 +35,12 @@ def evidence(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float64[np.ndarray
     """What tells the error of every position: logs of how deep it is, how far it has moved, how far apart other
     estimates put it, and how far it lands when followed back; doubt of the tracker in it (0 to 1); whether it is
     hidden, or without depth; and the log of for how many frames it has been hidden."""
-    z = np.maximum(clip.to_camera(lifted.xyz_world)[..., 2], 0.05)
+    xyz_cam = clip.to_camera(lifted.xyz_world)
+    z = np.maximum(xyz_cam[..., 2], 0.05)
     meters_per_px = z / clip.camera.K[0, 0]
     moved = np.linalg.norm(lifted.xyz_world - lifted.xyz_world[:1], axis=-1)
+    if clip.T_world_cam is not None:  # what stands still was followed through the pictures, too
+        moved = np.maximum(moved, np.linalg.norm(xyz_cam - xyz_cam[:1], axis=-1))
     columns = (
         np.ones_like(z),
         np.log(z),

@@ -1,6 +1,8 @@
 """What is the same in the results of two runs of a command: all but measured times, memory and what shows them."""
 
+import csv
 import hashlib
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -9,7 +11,7 @@ from typing import Any
 
 from flowlab.checksums import CHECKSUM, json_checksum
 
-_MEASURED = re.compile(r"^(cpu_s|wall_s|samples_per_s|ms_per_frame|peak_memory_mb)$")
+_MEASURED = re.compile(r"^(cpu_s|training_cpu_s|wall_s|samples_per_s|ms_per_frame|peak_memory_mb)$")
 """Keys whose values are of one run: how long it took, and how much memory."""
 _PICTURES_OF_TIMES = ("curve.png",)
 _RERUN = b"RRF2"
@@ -47,6 +49,9 @@ def _digest(file: Path) -> str:
         return f"a recording of {content[:4]!r}{_RERUN in content[-64:]}"
     if file.suffix in (".json", ".jsonl"):
         content = _without_measures(content)
+    if file.suffix == ".csv":
+        rows = list(csv.DictReader(io.StringIO(content.decode())))
+        content = json.dumps(still(rows)).encode()
     return hashlib.sha256(content).hexdigest()
 
 

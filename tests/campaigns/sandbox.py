@@ -86,6 +86,8 @@ def call(
     logs = folder.parent / f"{folder.name}.log"
     shutil.rmtree(logs, ignore_errors=True)
     logs.mkdir()
+    for name in ("out", "err", "stacks"):  # a kill may come before anything else
+        (logs / name).touch()
     start = time.monotonic()
     child = os.fork()
     if child == 0:

@@ -77,11 +77,17 @@ OTHER = {"width": 160, "height": 120}
         ({"fx": 150, "fy": 79.5, "cx": 150, "cy": 59.5}, "fy and cx look swapped.*fy: 150.0, cx: 79.5"),
         (
             {"fx": 75, "fy": 75, "cx": 39.5, "cy": 29.5},
-            "of pictures of 80x60.*fx: 150.0, fy: 150.0, cx: 79.5, cy: 59.5}",
+            "the same pictures in 80x60.*fx: 150.0, fy: 150.0, cx: 79.5, cy: 59.5}",
         ),
-        ({"fx": 750, "fy": 750, "cx": 399.5, "cy": 299.5, **OTHER}, "of 800x600.*fx: 150.0, .*cx: 79.5, cy: 59.5}"),
-        ({"fx": 112.5, "fy": 112.5, "cx": 59.5, "cy": 44.5}, "of 120x90.*fx: 150.0, .*cx: 79.5, cy: 59.5}"),
-        ({"fx": 412.5, "fy": 412.5, "cx": 219.5, "cy": 164.5}, "of pictures of 440x330.*fx: 150.0"),
+        (
+            {"fx": 750, "fy": 750, "cx": 399.5, "cy": 299.5, **OTHER},
+            "same pictures in 800x600.*fx: 150.0, .*cx: 79.5, cy: 59.5}",
+        ),
+        (
+            {"fx": 112.5, "fy": 112.5, "cx": 59.5, "cy": 44.5},
+            "same pictures in 120x90.*fx: 150.0, .*cx: 79.5, cy: 59.5}",
+        ),
+        ({"fx": 412.5, "fy": 412.5, "cx": 219.5, "cy": 164.5}, "the same pictures in 440x330.*fx: 150.0"),
         ({"fx": 150, "fy": 150, "cx": 20, "cy": 59.5}, r"add 'cropped: true', else write .*{fx: \.\.\."),
         ({"fx": 150, "fy": 20, "cx": 79.5, "cy": 59.5}, "differ by 650%"),
         ({"fx": 2000, "fy": 2000, "cx": 79.5, "cy": 59.5}, "field of view of 5"),

@@ -10,8 +10,9 @@ from real_recordings import STEPS, write_folder
 from synthetic import call_cli
 
 from flowlab.errors import DataError
+from flowlab.recordings.columns import find_columns
 from flowlab.recordings.readers.joint_states import join_by_name
-from flowlab.recordings.tables import find_columns, parse_table
+from flowlab.recordings.tables import parse_table
 
 OPTIONS = ("--tracker", "lucas-kanade", "--dry-run", "--json")
 CLOCK = np.arange(STEPS) / 10

@@ -67,6 +67,19 @@ def test_moved_points_are_less_sure() -> None:
     np.testing.assert_allclose(sigma[3:, 1:], np.broadcast_to(sigma[2, 1:], (3, 3)), rtol=1e-5)
 
 
+def test_under_a_camera_that_moves_what_stands_still_is_no_surer() -> None:
+    clip, tracks, lifted = case()
+    still = replace(lifted, xyz_world=np.repeat(lifted.xyz_world[:1], T, axis=0))
+    poses = np.tile(clip.camera.T_world_cam.astype(float), (T, 1, 1))
+    poses[:, 0, 3] += 0.05 * np.arange(T)
+    beside, before = (stated_error(c, tracks, still) for c in (replace(clip, T_world_cam=poses), clip))
+    carried = replace(
+        still, xyz_world=still.xyz_world - np.float32([0.05, 0, 0]) * np.arange(T)[:, None, None].astype("f")
+    )
+    np.testing.assert_allclose(beside, stated_error(clip, tracks, carried), rtol=1e-4)
+    assert (beside[1:] > before[1:]).all()
+
+
 def test_the_worlds_frame_does_not_matter() -> None:
     T_world_cam = rigid(np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]]), np.array([0.3, -1.0, 2.0]))
     here, there = stated_error(*case()), stated_error(*case(T_world_cam=T_world_cam))

@@ -10,15 +10,16 @@ import numpy as np
 from flowlab.array_files import map_array, map_member
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
+from flowlab.recordings.camera_numbers import camera_numbers
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME, Metadata
+from flowlab.recordings.metadata import FILE_NAME, Metadata, combine
 from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.unused_files import robot_numbers, some_of
 from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import cut, natural_key
+from flowlab.text import cut, natural_key, shown
 
 NAMES = {
     "color": ("color", "rgb", "img", "image", "images", "colors"),
@@ -44,6 +45,8 @@ NAMES = {
     "ends": ("episode_ends",),
 }
 """What arrays may be called, by what they are."""
+_MOST_TOLD = 4 << 20
+"""Larger arrays are not a camera's [bytes]."""
 POSES = ("T_world_cam", "cam2world", "camera_to_world")
 """Those of poses whose names say that they map the camera to the world."""
 
@@ -87,6 +90,7 @@ class ArraysReader:
             )
         if missing:
             raise DataError(f"{path}: has no array for {missing[0]}; it may be called {', '.join(NAMES[missing[0]])}")
+        _check_single(path, names)
         store = _Store(path, names)
         color, depth = store.load("color"), store.load("depth")
         assert color is not None
@@ -109,7 +113,7 @@ class ArraysReader:
             state=_samples(store, "state", *stamps),
             action=_samples(store, "action", *stamps),
             known=known,
-            checks=_unused_members(path, names),
+            checks=_unused_members(path, names, combine([("", given), *known])[0], poses is not None),
             used=tuple(f"{name}.npy" for what, name in names.items() if what != "cloud"),
             poses=poses,
         )
@@ -117,8 +121,27 @@ class ArraysReader:
 
 def _find(path: Path) -> dict[str, str]:
     """What arrays there are, by name; nothing is read of them."""
-    present = _members(path) if path.is_file() else {f.stem for f in path.glob("*.npy")}
+    present = _present(path)
     return {what: name for what, names in NAMES.items() for name in reversed(names) if name in present}
+
+
+def _present(path: Path) -> set[str]:
+    """Names of the arrays there are."""
+    return _members(path) if path.is_file() else {f.stem for f in path.glob("*.npy")}
+
+
+def _check_single(path: Path, used: dict[str, str]) -> None:
+    """Refuse several arrays that are called as one thing, unless they are the same."""
+    present = _present(path)
+    for what in ("color", "depth", "state", "action", "time", "intrinsics", "pose"):
+        several = [name for name in NAMES[what] if name in present]
+        if len(several) < 2:
+            continue
+        found = [array for name in several if (array := _Store(path, {what: name}).load(what)) is not None]
+        if not all(np.array_equal(found[0], other) for other in found[1:]):
+            raise DataError(f"{path}: {', '.join(several)} may all be the {what}, and are not the same; keep "
+                            f"one, or call the "
+                            "others otherwise")  # fmt: skip
 
 
 def _members(path: Path) -> set[str]:
@@ -132,7 +155,7 @@ def _members(path: Path) -> set[str]:
         return set()
 
 
-def _unused_members(path: Path, names: dict[str, str]) -> tuple[Check, ...]:
+def _unused_members(path: Path, names: dict[str, str], known: Metadata, posed: bool) -> tuple[Check, ...]:
     """The arrays of an ``.npz`` file that no stream uses, by name; those of a folder are files."""
     if path.is_dir():
         return ()
@@ -143,7 +166,22 @@ def _unused_members(path: Path, names: dict[str, str]) -> tuple[Check, ...]:
     wanted = ", ".join(what for what in ("state", "action") if what not in names)
     hint = f"; one that is the {wanted.replace(', ', ' or the ')} must be called so" if wanted else ""
     says = f"{some_of(unused)} (no stream uses them{hint})"
-    return (Check("left out", Verdict.DOUBTFUL if _of_robots(unused, names) else Verdict.OK, says),)
+    checks = [Check("left out", Verdict.DOUBTFUL if _of_robots(unused, names) else Verdict.OK, says)]
+    for name in unused:
+        values = _small_member(path, name)
+        told = None if values is None else camera_numbers(name, values, known, posed)
+        checks += [] if told is None else [Check("camera", Verdict.DOUBTFUL, f"{shown(name)} is not used; {told}")]
+    return tuple(checks)
+
+
+def _small_member(path: Path, name: str) -> np.ndarray | None:
+    """An array that nothing uses; None where it is large, or cannot be read, which then does not matter."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = file.getinfo(f"{name}.npy").file_size
+        return map_member(path, name) if size <= _MOST_TOLD else None
+    except (DataError, KeyError, OSError, zipfile.BadZipFile):
+        return None
 
 
 def _of_robots(unused: list[str], names: dict[str, str]) -> bool:

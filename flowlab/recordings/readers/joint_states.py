@@ -13,6 +13,9 @@ from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 
+_UNNAMED = "\0"
+"""Begins what joints without names are called here, by how many there are and their place."""
+
 
 @dataclass(frozen=True, slots=True)
 class JointGroup:
@@ -25,7 +28,9 @@ class JointGroup:
     positions: Float32[np.ndarray, "N D"]
 
 
-def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup], list[Check]]:
+def join_by_name(
+    place: str, messages: Sequence[Any], publishers: Sequence[str] = ()
+) -> tuple[list[JointGroup], list[Check]]:
     """The positions of joints by name: those that always come together are a group, with samples of its own.
 
     Two arms that publish in turn are two groups; a joint that only some messages have is one, too.
@@ -33,6 +38,7 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
     Args:
         place: The recording and the topic, for messages.
         messages: The JointStates, in the order of recording.
+        publishers: Who sent each, where several send in turn: joints that more than one has are then called by both.
 
     Returns:
         The groups, in the order of their first message; and what is to be said of them.
@@ -40,7 +46,7 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
     Raises:
         DataError: Names and positions of a message do not fit together, or a joint has no position at all.
     """
-    rows = [_named(place, k, message) for k, message in enumerate(messages)]
+    rows = _of_publishers([_named(place, k, message) for k, message in enumerate(messages)], publishers)
     seen: dict[str, list[int]] = defaultdict(list)
     for k, row in enumerate(rows):
         for name in row:
@@ -60,7 +66,7 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
         if not whole.all():
             says = f"{(~whole).sum()} of {len(whole)} messages hold no number for {_worst(names, finite)}: not used"
             checks.append(Check("state", Verdict.DOUBTFUL, says))
-        names = [] if names[0].startswith("\0") else names
+        names = [] if names[0].startswith(_UNNAMED) else names
         groups.append(JointGroup(tuple(names), np.array(places)[whole], values[whole]))
     if len(groups) > 1:
         listed = "; ".join(f"{cut(', '.join(g.names))} in {len(g.messages)}" for g in groups)
@@ -71,6 +77,22 @@ def join_by_name(place: str, messages: Sequence[Any]) -> tuple[list[JointGroup],
     return groups, checks
 
 
+def _of_publishers(rows: list[dict[str, float]], publishers: Sequence[str]) -> list[dict[str, float]]:
+    """The same positions; names that several publishers have get the publisher's before them."""
+    owners: dict[str, set[str]] = defaultdict(set)
+    for row, publisher in zip(rows, publishers, strict=False):
+        for name in row:
+            owners[name].add(publisher)
+    if all(len(owner) < 2 for owner in owners.values()):
+        return rows
+
+    def called(name: str, publisher: str) -> str:
+        plain = name.rpartition(" ")[2] if name.startswith(_UNNAMED) else name
+        return f"{publisher}/{plain}" if len(owners[name]) > 1 else name
+
+    return [{called(name, who): x for name, x in row.items()} for row, who in zip(rows, publishers, strict=True)]
+
+
 def _worst(names: Sequence[str], finite: np.ndarray) -> str:
     return cut(names[int(finite.sum(0).argmin())])
 
@@ -79,7 +101,7 @@ def _named(place: str, k: int, message: Any) -> dict[str, float]:
     """The positions of a message by name; without names, by their place among as many."""
     positions, names = np.asarray(message.position, float).ravel().tolist(), [str(n) for n in message.name]
     if not names:
-        names = [f"\0{len(positions)} {i}" for i in range(len(positions))]
+        names = [f"{_UNNAMED}{len(positions)} {i}" for i in range(len(positions))]
     if len(names) != len(positions) or len(set(names)) != len(names):
         raise DataError(
             f"{place}: message {k + 1} has {len(positions)} positions for the joints {cut(', '.join(names))}, expected "

@@ -1,21 +1,21 @@
 """The plain folder: ``color/``, ``depth/`` and a ``recording.yaml``; what flowlab itself writes."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from flowlab.errors import DataError, first_line
+from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.file_stamps import read_names
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
-from flowlab.recordings.intrinsics import Intrinsics, is_transposed
 from flowlab.recordings.metadata import FILE_NAME, Metadata, load_metadata
+from flowlab.recordings.readers.open3d_json import open3d_calibration
 from flowlab.recordings.sample_files import load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.writing import write_rgbd_recording
-from flowlab.untrusted import read_json
 
 __all__ = ["PlainReader", "write_rgbd_recording"]
 
@@ -39,9 +39,9 @@ class PlainReader:
 
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams; their times are the numbers in the names over ``fps``, or from files."""
-        known = open3d_calibration(path)
+        known, checks = open3d_calibration(path)
         fps = given.fps or next((m.fps for _, m in known if m.fps), None)
-        return read_folder(path, given, fps, known)
+        return replace(read_folder(path, given, fps, known), checks=checks)
 
 
 def read_folder(path: Path, given: Metadata, fps: float | None, known: tuple[tuple[str, Metadata], ...]) -> Streams:
@@ -58,28 +58,6 @@ def read_folder(path: Path, given: Metadata, fps: float | None, known: tuple[tup
         depth_stream(*read_names(depth, f"the names in {given.depth}/")),
         known=known,
     )
-
-
-def open3d_calibration(path: Path) -> tuple[tuple[str, Metadata], ...]:
-    """What Open3D's recorder and bag reader write beside the pictures: ``intrinsic.json``."""
-    for name in ("intrinsic.json", "camera_intrinsic.json"):
-        file = path / name
-        if not file.is_file():
-            continue
-        values = read_json(file, f"give 'intrinsics' in {FILE_NAME}")
-        try:
-            K = np.array(values["intrinsic_matrix"], float).reshape(3, 3)
-            K = K.T if is_transposed(K) else K  # Open3D writes it by columns, others nest its rows
-            size = {"width": int(values["width"]), "height": int(values["height"])}
-            found = {"intrinsics": Intrinsics.from_matrix(K, **size)}
-            scale = values.get("depth_scale")
-            extra = {"fps": values.get("fps"), "depth_unit_m": float(f"{1 / scale:.6g}") if scale else None}
-            return ((name, Metadata(**found, **{k: v for k, v in extra.items() if v})),)
-        except (AttributeError, ValueError, KeyError, TypeError, ArithmeticError) as error:
-            raise DataError(
-                f"{file}: is not what Open3D writes ({first_line(error)}); give 'intrinsics' in {FILE_NAME}"
-            ) from error
-    return ()
 
 
 def _list(path: Path, what: str, folder: str, suffixes: tuple[str, ...]) -> list[Path]:

@@ -9,7 +9,8 @@ from flowlab.files import new_folder
 from flowlab.limits import MAX_ARRAY_BYTES
 from flowlab.recordings.base import Streams
 from flowlab.recordings.metadata import FILE_NAME, Metadata
-from flowlab.recordings.readers.plain import open3d_calibration, read_folder
+from flowlab.recordings.readers.open3d_json import open3d_calibration
+from flowlab.recordings.readers.plain import read_folder
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 from flowlab.untrusted import check_regular, read_json
@@ -34,7 +35,7 @@ class RealSenseReader:
         if not is_sdk_bag(path):
             raise DataError(f"{path}: is no bag of the RealSense SDK; a general ROS bag is read by the reader 'ros'")
         folder = extracted(path)
-        known = open3d_calibration(folder)
+        known, told = open3d_calibration(folder)
         fps = given.fps or next((m.fps for _, m in known if m.fps), None)
         if fps is None:
             raise DataError(
@@ -45,7 +46,7 @@ class RealSenseReader:
         lost = _lost(folder, len(streams.color), fps)
         return Streams(
             streams.color, streams.depth, known=known, registered=True,
-            checks=(Check("frame rate", Verdict.ASSUMED, "times are frame numbers over the frame rate"), *lost),
+            checks=(Check("frame rate", Verdict.ASSUMED, "times are frame numbers over the frame rate"), *told, *lost),
         )  # fmt: skip
 
 

@@ -29,6 +29,8 @@ from flowlab.untrusted import read_json, read_text
 _MAX_ROW_BYTES = 1 << 20
 _LATEST_MS = 1e15
 """In the year 33658."""
+_LENS = re.compile(r"dist|lens|coef")
+"""What files of distortion are called."""
 STATE = ("tcp", "gripper_command")
 """Folders of robot state, in the order of its columns."""
 
@@ -187,8 +189,12 @@ def _calibration(
     T_cam_marker = pickled_numbers(folder / "extrinsics.npy", serial)
     if T_cam_marker is not None:
         values["T_world_cam"] = _pose(folder / "extrinsics.npy", serial, T_cam_marker)
+    checks = []
+    if lens := sorted(f.name for f in folder.iterdir() if _LENS.search(f.name.lower())):
+        says = f"calib/{name} has {cut(', '.join(lens))}, which is not read; write the 'distortion' into 'intrinsics'"
+        checks.append(Check("calibration", Verdict.DOUBTFUL, f"{says} in {FILE_NAME}"))
     says = "the world is the marker of the calibration" if T_cam_marker is not None else "its pose is not calibrated"
-    return ((f"calib/{name}", Metadata(**values)),), (Check("world", Verdict.OK, says),)
+    return ((f"calib/{name}", Metadata(**values)),), (Check("world", Verdict.OK, says), *checks)
 
 
 def _pose(file: Path, serial: str, T_cam_marker: np.ndarray) -> list[list[float]]:

@@ -10,8 +10,10 @@ from jaxtyping import Float64, Int64
 
 from flowlab.errors import DataError, MissingLibraryError, first_line
 from flowlab.limits import MAX_ARRAY_BYTES
+from flowlab.recordings.readers.publishers import Who, who_sent
 from flowlab.recordings.readers.ros_limits import limit_decompression, limited_memory
 from flowlab.recordings.readers.ros_messages import stamp_s
+from flowlab.recordings.readers.ros_types import open_reader
 from flowlab.text import cut
 from flowlab.untrusted import check_regular, parse_yaml, read_text
 
@@ -31,6 +33,8 @@ class BagIndex:
     """How many messages of the topic with the same time of recording came before."""
     measured_s: Float64[np.ndarray, "N"]
     """As the messages say; nan where they do not."""
+    sent: tuple[Who, ...]
+    """By whom."""
 
 
 class RosBag:
@@ -39,8 +43,7 @@ class RosBag:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
+            import rosbags.highlevel  # noqa: F401
         except ImportError as error:
             raise MissingLibraryError(
                 f"{path}: reading ROS recordings needs the rosbags package ({error}); 'pip install flowlab[ros]'"
@@ -48,10 +51,8 @@ class RosBag:
         _check_files(path)
         limit_decompression()
         try:
-            # Before 2023, ROS 2 recordings did not say what their messages look like.
-            self._reader: AnyReader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             with limited_memory():
-                self._reader.open()
+                self._reader, self.unread = open_reader(path)
                 self._counts = {topic: int(about.msgcount) for topic, about in self._reader.topics.items()}
         except Exception as error:  # rosbags lets through what its parsers raise
             raise DataError(f"{path}: is no readable ROS recording ({_words(error)})") from error
@@ -66,16 +67,18 @@ class RosBag:
         """Topics that hold messages of these types, with how many."""
         found: dict[str, int] = {}
         for c in self._reader.connections:
-            if c.msgtype in types and self._counts.get(c.topic):
+            if c.msgtype in types and c.topic not in self.unread and self._counts.get(c.topic):
                 found[c.topic] = self._counts[c.topic]
         return dict(sorted(found.items()))
 
     def types(self) -> dict[str, str]:
-        """The type of every topic."""
-        return {c.topic: c.msgtype for c in self._reader.connections}
+        """The type of every topic that can be read."""
+        return {c.topic: c.msgtype for c in self._reader.connections if c.topic not in self.unread}
 
     def first(self, topic: str) -> Any:
         """The first message of a topic."""
+        if topic in self.unread:
+            raise DataError(f"{self.path}: {cut(topic)} cannot be read ({cut(self.unread[topic])})")
         message = next((message for _, message in self.messages(topic)), None)
         if message is None:
             raise DataError(f"{self.path}: the topic {topic} holds no messages; choose another with 'topics'")
@@ -90,16 +93,26 @@ class RosBag:
         self, topic: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[int, Any]]:
         """Time of recording [ns] and content of the messages of a topic."""
+        for time_ns, message, _ in self._all(topic, start_ns, stop_ns):
+            yield time_ns, message
+
+    def _all(
+        self, topic: str, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[int, Any, str]]:
+        """Time of recording [ns] and content of the messages of a topic, and through which connection each came."""
         messages = self._reader.messages(self._connections(topic), start_ns, stop_ns)
         while (message := self._next(topic, messages)) is not None:
             yield message
 
-    def _next(self, topic: str, messages: Iterator[tuple[Any, int, bytes]]) -> tuple[int, Any] | None:
-        """Time of recording [ns] and content of the next message; None after the last."""
+    def _next(self, topic: str, messages: Iterator[tuple[Any, int, bytes]]) -> tuple[int, Any, str] | None:
+        """The next message, as :meth:`_all` gives it; None after the last."""
         try:
             with limited_memory():
                 found = next(messages, None)
-                return None if found is None else (found[1], self._reader.deserialize(found[2], found[0].msgtype))
+                if found is None:
+                    return None
+                node = getattr(found[0].ext, "callerid", None) or f"connection {found[0].id}"
+                return found[1], self._reader.deserialize(found[2], found[0].msgtype), node
         except DataError:
             raise
         except Exception as error:
@@ -107,14 +120,15 @@ class RosBag:
 
     def index(self, topic: str) -> BagIndex:
         """When every message of a topic is from."""
-        recorded, measured = [], []
-        for time_ns, message in self.messages(topic):
+        recorded, measured, sent = [], [], []
+        for time_ns, message, connection in self._all(topic):
             recorded.append(time_ns)
             measured.append(stamp_s(message))
+            sent.append(who_sent(message, connection))
         times = np.array(recorded, np.int64)
         fresh = np.append(True, times[1:] != times[:-1])
         nth = np.arange(len(times)) - np.flatnonzero(fresh)[np.cumsum(fresh) - 1]
-        return BagIndex(times, nth, np.array([np.nan if m is None else m for m in measured]))
+        return BagIndex(times, nth, np.array([np.nan if m is None else m for m in measured]), tuple(sent))
 
     def message(self, topic: str, index: BagIndex, i: int) -> Any:
         """One message."""

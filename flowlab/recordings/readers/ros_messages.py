@@ -1,18 +1,15 @@
 """What ROS messages mean, whichever of ROS 1 and 2 they come from."""
 
-import re
 from collections.abc import Iterable
 from typing import Any
 
 import cv2
 import numpy as np
 
-from flowlab.config import SettingsError
 from flowlab.geometry.transforms import inverse, rigid
 from flowlab.limits import MAX_PIXELS
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.image_files import check_depth, decode_color, decode_depth
-from flowlab.recordings.intrinsics import Intrinsics, distortion_of
 from flowlab.text import shown
 
 _CHANNELS = {
@@ -88,49 +85,6 @@ def stamp_s(message: Any) -> float | None:
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     time_s = None if stamp is None else stamp.sec + stamp.nanosec * 1e-9
     return time_s or None
-
-
-def intrinsics_of(info: Any, topic: str) -> Intrinsics | None:
-    """Intrinsics of a CameraInfo, for pictures of a topic; None for a camera that was not calibrated.
-
-    Pictures that were rectified are seen as P says, without distortion; others as K and D say. Both are of the whole
-    picture, of which the topic may have a part (``roi``), or every n-th pixel (``binning``).
-    """
-    K, D, P = (np.asarray(getattr(info, k, getattr(info, k.lower(), ()))) for k in "KDP")
-    if K.size != 9 or not K[0] > 0:
-        return None
-    if not is_rectified(topic):
-        return _part(Intrinsics.from_matrix(K.reshape(3, 3), **distortion_of(info.distortion_model, D.tolist())), info)
-    if P.size == 12 and P[0] > 0:
-        return _part(Intrinsics.from_matrix(P.reshape(3, 4)), info)
-    if np.any(D):
-        raise SettingsError(f"the pictures of {topic} were rectified, and its CameraInfo has no P that says how they "
-                            "are seen; write 'intrinsics' of the rectified pictures")  # fmt: skip
-    return _part(Intrinsics.from_matrix(K.reshape(3, 3)), info)
-
-
-def is_rectified(topic: str) -> bool:
-    """Whether a topic's pictures were rectified, by any part of its name: ``rgb/image_rect_color/compressed``."""
-    return re.search(r"(^|[/_])rect(ified)?([/_]|$)", topic.lower()) is not None
-
-
-def _part(whole: Intrinsics, info: Any) -> Intrinsics:
-    """Intrinsics of the part of the picture that is sent, as ``image_geometry`` has them."""
-    roi, binned = info.roi, (max(1, info.binning_x), max(1, info.binning_y))
-    cut = 0 < roi.width < info.width or 0 < roi.height < info.height
-    size = (roi.width, roi.height) if cut else (info.width, info.height)
-    x, y = (roi.x_offset, roi.y_offset) if cut else (0, 0)
-    return whole.model_copy(
-        update={
-            "width": size[0] // binned[0] or None,
-            "height": size[1] // binned[1] or None,
-            "fx": whole.fx / binned[0],
-            "fy": whole.fy / binned[1],
-            "cx": (whole.cx - x) / binned[0],
-            "cy": (whole.cy - y) / binned[1],
-            "cropped": cut,
-        }
-    )
 
 
 def message_numbers(message: Any) -> list[float]:

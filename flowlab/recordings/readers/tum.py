@@ -1,5 +1,6 @@
 """The layout of the TUM RGB-D benchmark: ``rgb.txt`` and ``depth.txt`` list pictures with their times."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,6 +34,9 @@ KINECTS = {
 }  # fmt: skip
 """The benchmark's own calibration of the three color cameras; their sequences carry these names."""
 
+_OF_BENCHMARK = re.compile(r"rgbd_dataset_(freiburg[123])(_|$)")
+"""What the benchmark's own sequences are called; other recordings may be of Freiburg, too."""
+
 
 class TUMReader:
     """Reads sequences of the benchmark, and what is recorded in its layout."""
@@ -59,7 +63,8 @@ class TUMReader:
                 pairs = [(*p[2:], *p[:2]) for p in pairs]
             color, depth = [p[:2] for p in pairs], [p[2:] for p in pairs]
         known = [("the custom of TUM RGB-D", Metadata(depth_unit_m=1 / DEPTH_FACTOR))]
-        camera = next((name for name in KINECTS if name in path.resolve().name), None)
+        found = _OF_BENCHMARK.match(path.resolve().name)
+        camera = None if found is None else found[1]
         if camera is not None:
             known.append((f"TUM RGB-D's calibration of {camera}", Metadata(intrinsics=KINECTS[camera])))
         files = [[path / entry[1] for entry in entries] for entries in (color, depth)]
