@@ -32,7 +32,7 @@ _CLARITY = (4.0, 5.0)
 """The best place is above all places by so many standard deviations, for a doubt and for a refusal."""
 _GAIN = (0.12, 0.35)
 """Likewise, it is this much better than where depth lies."""
-_LIES = 0.35
+_LIES = 0.25
 """Where edges of depth lie on those of color, these are as strong, in standard deviations of the picture."""
 _CLEAR, _CLEAR_SHARE = 40.0, 0.03
 """A gradient of a smoothed picture, by Sobel, is no noise beyond this; so many pixels have one, or all is dim."""
