@@ -19,6 +19,8 @@ _TIMES = {
 """What columns of times are called, without their unit, case and signs."""
 _COUNTS = {"", "index", "frame", "frames", "seq", "id", "row", "no", "unnamed0", "step", "sample", "fieldheaderseq"}
 """What columns that number the rows are called."""
+_FRAMES = {"frame", "frames", "framenumber", "frameno", "frameid", "frameindex", "frameidx", "framecount"}
+"""What columns with the numbers of the pictures' frames are called."""
 _UNITS = {
     "s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3, "millis": 1e-3,
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
@@ -48,10 +50,17 @@ class Columns:
     unit_known: bool
     names: tuple[str, ...]
     values: Float64[np.ndarray, "N D"]
+    are_frames: bool = False
+    """Whether the times are numbers of frames, those of the pictures."""
 
 
 def find_columns(
-    table: SampleTable, name: str, chosen: Sequence[str] | None, color_s: np.ndarray, timed: bool
+    table: SampleTable,
+    name: str,
+    chosen: Sequence[str] | None,
+    color_s: np.ndarray,
+    timed: bool,
+    numbered: bool = False,
 ) -> Columns:
     """The times of a table and the numbers that are the state, or the action.
 
@@ -61,6 +70,7 @@ def find_columns(
         chosen: Names of the columns to take, in this order; None for all that are not times.
         color_s: Times of the color pictures.
         timed: Whether the rows have their times in another file.
+        numbered: Whether the pictures' names number frames, so that rows may have the numbers of theirs.
 
     Raises:
         DataError: Columns that are chosen do not exist, or it is not clear which are meant.
@@ -68,10 +78,11 @@ def find_columns(
     pair = _whole_and_part(table)
     times = [k for k, n in enumerate(table.names) if base_and_unit(n)[0] in _TIMES]
     times = [*pair[:1], *(k for k in times if k not in pair)]
-    rest = [k for k in range(table.values.shape[1]) if k not in times[:1] and k not in pair]
+    frames = _frame_numbers(table) if numbered and not (times or timed) else []
+    rest = [k for k in range(table.values.shape[1]) if k not in (*times[:1], *pair, *frames)]
     if chosen is not None:
         rest = [table.column(n) for n in chosen]
-    time, known = _own_time(table, pair, times)
+    time, known = _own_time(table, pair, times or frames)
     if chosen is None or table.text & set(rest):
         rows_s = time if known else color_s if len(color_s) == len(table.values) and not (timed or times) else None
         doubts = _doubts(table, rest, times, color_s, timed)
@@ -80,7 +91,14 @@ def find_columns(
         } | doubts
         _check_meaning(table, name, rest, doubts)
     names = tuple(table.names[k] for k in rest) if table.names else ()
-    return Columns(time, known, names, table.values[:, rest])
+    return Columns(time, known, names, table.values[:, rest], bool(frames))
+
+
+def _frame_numbers(table: SampleTable) -> list[int]:
+    """The column with the number of each row's frame; none where there is none, or several may be it."""
+    called = [k for k, n in enumerate(table.names) if plain_name(n) in _FRAMES]
+    columns = table.values[:, called]
+    return called if len(called) == 1 and _rises(columns[:, 0]) and (columns % 1 == 0).all() else []
 
 
 def _own_time(table: SampleTable, pair: Sequence[int], times: Sequence[int]) -> tuple[np.ndarray | None, bool]:

@@ -1,6 +1,7 @@
 """Files of numbers: times, and rows of robot state or actions."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +42,13 @@ def load_samples(
     columns: Sequence[str] | None = None,
     fps: float | None = None,
 ) -> SampleStream:
-    """Rows of numbers: with times of their own (a file, or a column of times), else one per color picture."""
-    found = find_columns(read_table(path), name, columns, rough_seconds(color.time_s, color.timing, fps), bool(times))
+    """Rows of numbers: with times, or numbers of frames, of their own (a file, or a column), else one per picture."""
+    numbered = color.timing.names and color.timing.integers and fps is not None
+    rough_s = rough_seconds(color.time_s, color.timing, fps)
+    found = find_columns(read_table(path), name, columns, rough_s, bool(times), numbered)
     own = None if found.time is None else check_times(path, found.time, not (found.time % 1).any(), found.unit_known)
+    if own is not None and found.are_frames:
+        own = own[0], replace(own[1], names=True)
     if times is not None:
         own = load_times(times)
     where, timing = (color.time_s, color.timing) if own is None else own

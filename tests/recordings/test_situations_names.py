@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from real_recordings import STEPS, write_folder
+from real_recordings import STEPS, opened, write_folder
 from synthetic import call_cli
 
 from flowlab.errors import DataError
@@ -67,6 +67,30 @@ def test_times_are_found_by_name_and_unit(text: str, unit_s: float) -> None:
 def test_what_is_not_clear_is_asked(text: str, says: str) -> None:
     with pytest.raises(DataError, match=says):
         find_columns(parse_table(Path("state.csv"), text), "state", None, CLOCK, False)
+
+
+@pytest.mark.parametrize(
+    ("frames", "keys", "first"),
+    [
+        (range(8), {}, [0, 1, 2, 3, 4, 5, 6, 7]),
+        ([0, 1, 2, 4, 5, 6, 7], {}, [0, 1, 2, 4, 5, 6, 7]),  # the picture without a row is no good frame
+        (range(1, 9), {"state_offset_s": -0.1}, [1, 2, 3, 4, 5, 6, 7, 8]),
+    ],
+)
+def test_rows_with_the_numbers_of_frames_belong_to_these(
+    frames: list[int], keys: dict[str, float], first: list[int], tmp_path: Path
+) -> None:
+    folder = write_folder(tmp_path / "pour/0", steps=8, state="state.csv", **keys)
+    (folder / "state.csv").write_text("Frame,x\n" + "".join(f"{f},{f * f}\n" for f in frames))
+    state = opened(folder, max_bad_share=0.5).state
+    assert state[:, 0].tolist() == [f * f for f in first]
+
+
+def test_frames_of_another_counter_are_asked_about(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "pour/0", steps=8, state="state.csv")
+    (folder / "state.csv").write_text("frame,x\n" + "".join(f"{f},{f}\n" for f in range(1, 9)))
+    with pytest.raises(DataError, match=r"color has the numbers 0 to 7, state 1 to 8: .*'state_offset_s: 0'"):
+        opened(folder)
 
 
 def joints(names: str, *positions: float) -> SimpleNamespace:
