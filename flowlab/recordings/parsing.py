@@ -111,7 +111,8 @@ class ParsedRecording:
             some = "; ".join(f"{b.name} {b.reason}" for b in seen.bad[:3]) or "there are no others"
             raise DataError(
                 f"{self.path}: {len(seen.bad)} of {seen.looked_at} frames are bad ({some}), "
-                f"and {'none' if not allowed else f'at most {allowed:.0%}'} may be; see max_bad_share and max_sync_s"
+                f"and {'none' if not allowed else f'at most {allowed:.0%}'} may be; see max_bad_share, "
+                "max_sync_s and max_state_s"
             )
 
     def rows(self) -> AlignedSamples:

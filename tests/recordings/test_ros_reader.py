@@ -277,6 +277,18 @@ def test_no_depth_is_said_with_what_there_is(tmp_path: Path) -> None:
         opened(path)
 
 
+def test_an_encoding_that_is_not_read_is_named(tmp_path: Path) -> None:
+    def say_bayer(m: Messages, say: Say) -> None:
+        for t in range(STEPS):
+            say(COLOR, "sensor_msgs/msg/Image", instant(t), m.image(colors()[t, ..., 0], "bayer_rggb8", instant(t)))
+            say(DEPTH, "sensor_msgs/msg/Image", instant(t), m.image(counts()[t], "16UC1", instant(t), "depth"))
+
+    with pytest.raises(
+        DataError, match=r"no topic is known as color; .*bayer_rggb8 is not read: convert color to rgb8"
+    ):
+        opened(write_kind(tmp_path, "mcap", say_bayer))
+
+
 def test_aligned_depth_is_preferred(tmp_path: Path) -> None:
     def say_all(m: Messages, say: Say) -> None:
         say_camera(m, say)

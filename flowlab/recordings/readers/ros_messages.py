@@ -18,6 +18,7 @@ _CHANNELS = {
     "mono16": (np.uint16, 1), "16UC1": (np.uint16, 1), "32FC1": (np.float32, 1),
 }  # fmt: skip
 """Type and channels of the encodings that are read."""
+CONVERT = "convert color to rgb8 (image_proc does), depth to 16UC1 or 32FC1"
 _TO_RGB = {
     "bgr8": cv2.COLOR_BGR2RGB, "8UC3": cv2.COLOR_BGR2RGB, "bgra8": cv2.COLOR_BGRA2RGB,
     "rgba8": cv2.COLOR_RGBA2RGB, "mono8": cv2.COLOR_GRAY2RGB, "8UC1": cv2.COLOR_GRAY2RGB,
@@ -30,6 +31,11 @@ def is_depth(message: Any) -> bool:
     if hasattr(message, "format"):
         return "compressedDepth" in message.format or message.format.startswith(("16UC1", "32FC1"))
     return message.encoding in ("16UC1", "mono16", "32FC1")
+
+
+def is_read(message: Any) -> bool:
+    """Whether a picture is of an encoding that is read."""
+    return hasattr(message, "format") or message.encoding in _CHANNELS
 
 
 def is_color(message: Any) -> bool:
@@ -51,7 +57,7 @@ def decode_image(message: Any) -> np.ndarray:
         return _decode_compressed(message)
     encoding = message.encoding
     if encoding not in _CHANNELS:
-        raise BadImage(f"has the encoding {shown(encoding)}, which is not read; convert it to rgb8 (image_proc does)")
+        raise BadImage(f"has the encoding {shown(encoding)}, which is not read; {CONVERT}")
     dtype, channels = _CHANNELS[encoding]
     row = message.width * channels * np.dtype(dtype).itemsize
     data = np.asarray(message.data, np.uint8)

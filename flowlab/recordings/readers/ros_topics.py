@@ -7,7 +7,7 @@ from typing import Any
 from flowlab.errors import DataError
 from flowlab.recordings.metadata import FILE_NAME, Metadata, Topics
 from flowlab.recordings.readers.ros_bag import RosBag
-from flowlab.recordings.readers.ros_messages import is_color, is_depth
+from flowlab.recordings.readers.ros_messages import CONVERT, is_color, is_depth, is_read
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -95,7 +95,10 @@ def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int
     if not topics:
         kinds = bag.types() | {t: f"{bag.encoding(t)} pictures" for t in counts}
         every = ", ".join(f"{t} ({kind})" for t, kind in sorted(kinds.items())) or "no topic"
-        raise DataError(f"{bag.path}: no topic is known as {what}; it has {every}; name one in {where}: "
+        unread = [t for t in counts if not is_read(bag.first(t))]
+        encodings = ", ".join(sorted({bag.encoding(t) for t in unread}))
+        advice = f"{encodings} is not read: {CONVERT}; else " if unread else ""
+        raise DataError(f"{bag.path}: no topic is known as {what}; it has {every}; {advice}name one in {where}: "
                         f"'topics: {{{what}: ...}}'")  # fmt: skip
     some = ", ".join(f"{t} ({counts[t]} pictures)" for t in topics)
     raise DataError(
