@@ -10,6 +10,8 @@ from flowlab.recordings.lens import KNOWN, Lens, undistorted_rays
 from flowlab.recordings.verdicts import Check, Verdict
 
 _Size = tuple[int, int]
+_MOST_PX = 1e7
+"""No focal length or place in a picture is beyond this."""
 _NORMALIZED = 10.0
 """A focal length of fewer pixels is not in pixels."""
 _OFF_AXIS = (0.1, 0.2)
@@ -76,6 +78,10 @@ def _faults(about: str, given: Intrinsics, size: _Size, write_to: str) -> Iterat
     of = (given.width or size[0], given.height or size[1])
     if of != size:
         yield Verdict.REFUSED, _other_size(about, given, of, size, write_to)
+        return
+    if max(map(abs, (given.fx, given.fy, given.cx, given.cy))) > _MOST_PX or min(given.fx, given.fy) < 1 / _MOST_PX:
+        says = f"fx, fy, cx and cy are {given.fx:g}, {given.fy:g}, {given.cx:g} and {given.cy:g} px, as of no camera"
+        yield Verdict.REFUSED, f"{says}; correct '{about}' in {write_to}"
         return
     for fault in (_not_in_pixels(given, size), _off_axis(given, size)):
         if fault is not None:
@@ -155,7 +161,7 @@ def _is_usual(given: Intrinsics, size: _Size) -> bool:
 def _size_of(given: Intrinsics, size: _Size) -> _Size | None:
     """The size of the pictures that intrinsics are of, by their principal point; None where that does not tell."""
     usual = [*((round(size[0] * k), round(size[1] * k)) for k in _FACTORS), *_SIZES]
-    near = [of for of in usual if of != size and _is_central(given, of, _NEAR / 2)]
+    near = [of for of in usual if of != size and min(of) > 0 and _is_central(given, of, _NEAR / 2)]
     if near:
         return min(near, key=lambda of: (not _same_shape(of, size), abs((given.cx + 0.5) / of[0] - 0.5)))
     of = (round(2 * given.cx + 1), round(2 * given.cy + 1))

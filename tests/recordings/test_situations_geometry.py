@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,14 @@ import numpy as np
 import pytest
 import yaml
 from filmed_scenes import FLOOR, SCENE, TABLE, WALL, Box, film, looking
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
 from real_recordings import write_png, write_yaml
 from synthetic import call_cli
 from test_ros_reader import Messages, Say, instant, write_bag
 
+from flowlab.recordings.camera_check import check_camera
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.lens import Lens, lens_of, undistorted_rays, undistortion_maps
 
@@ -92,6 +97,7 @@ OTHER = {"width": 160, "height": 120}
         ({"fx": 150, "fy": 20, "cx": 79.5, "cy": 59.5}, "differ by 650%"),
         ({"fx": 2000, "fy": 2000, "cx": 79.5, "cy": 59.5}, "field of view of 5"),
         ({**GIVEN, "width": 214, "height": 120, "cx": 106.5}, "cuts the edges off.*cx: 79.5"),
+        ({"fx": 150, "fy": 150, "cx": 1.5e308, "cy": 59.5}, "as of no camera"),
         (K.T.tolist(), "is transposed; write '{fx: 150"),
         ([[150, 0, 79.5], [0, 150, 59.5]], "has the shape"),
         (
@@ -108,6 +114,17 @@ def test_intrinsics_that_cannot_be_are_refused(
     code, _, problem = verdicts(capsys, put(tmp_path / "r", still[:2], intrinsics=intrinsics))
     assert code == 3
     assert re.search(words, problem), problem
+
+
+NUMBER = st.sampled_from([5e-324, 1e-9, 1e-3, 0.5, 1.0, 79.5, 320.0, 1e4, 1e9, 1e154, 1.7e308]) | st.floats(1e-3, 1e4)
+
+
+@given(NUMBER, NUMBER, NUMBER, NUMBER, st.booleans(), st.sampled_from([(1, 1), (5, 3), (64, 48), (640, 480)]))
+def test_whatever_numbers_intrinsics_are_there_is_a_verdict(
+    fx: float, fy: float, cx: float, cy: float, left: bool, size: tuple[int, int]
+) -> None:
+    with suppress(ValidationError):
+        assert check_camera("intrinsics", Intrinsics(fx=fx, fy=fy, cx=-cx if left else cx, cy=cy), size, "a.yaml")
 
 
 @pytest.mark.parametrize(
