@@ -11,7 +11,7 @@ from flowlab.recordings.number_check import check_numbers
 from flowlab.recordings.pose_check import check_poses_fit
 from flowlab.recordings.registration_check import check_registration
 from flowlab.recordings.unused_times import check_unused_times
-from flowlab.recordings.verdicts import Check
+from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.recordings.world_check import check_world
 
 if TYPE_CHECKING:
@@ -32,13 +32,19 @@ def _geometry(source: "ParsedRecording") -> Iterator[Check]:
     seen, known = source.frame_check, source.metadata
     if not seen.samples:
         return
-    for about, camera, size in (
-        ("intrinsics", known.intrinsics, seen.color_size),
-        ("depth_intrinsics", known.depth_intrinsics, seen.depth_size),
-    ):
-        if camera is not None:
-            yield from check_camera(about, camera, size, source.write_to)
+    cameras = [
+        check
+        for about, camera, size in (
+            ("intrinsics", known.intrinsics, seen.color_size),
+            ("depth_intrinsics", known.depth_intrinsics, seen.depth_size),
+        )
+        if camera is not None
+        for check in check_camera(about, camera, size, source.write_to)
+    ]
+    yield from cameras
     yield from check_depth_unit(source)
+    if any(check.verdict is Verdict.REFUSED for check in cameras):
+        return  # what follows is seen through these
     yield check_registration(source)
     yield from check_world(source)
     yield check_motion(source) if seen.T_world_cam is None else check_poses_fit(source)

@@ -19,6 +19,8 @@ _FAR_M = (5.0, 20.0)
 """A camera this far from the world's origin is doubtful, and refused."""
 _BASELINE_M = (0.3, 1.0)
 """Likewise, of how far the depth camera is from the color camera."""
+_MOST_M = 1e3
+"""Points beyond this are of wrong numbers."""
 _PLANE_SHARE = 0.3
 """A plane that so many of the points lie on is one of the scene."""
 _SURE_SHARE = 0.4
@@ -181,7 +183,7 @@ def _cloud(source: "ParsedRecording") -> Float64[np.ndarray, "N 3"]:
 
 def _dominant_plane(cloud: Float64[np.ndarray, "N 3"]) -> _Plane | None:
     """The plane with most points, by trying planes through three of them; None where none has enough."""
-    cloud = cloud[np.isfinite(cloud).all(1)]
+    cloud = cloud[(np.abs(cloud) < _MOST_M).all(1)]  # which what is not finite is not
     if len(cloud) < 200:
         return None
     rng = np.random.default_rng(0)
