@@ -75,7 +75,7 @@ def _action_step_pairs(
     result: PolicyResult,
 ) -> Iterator[tuple[int, int, list[tuple[EpisodeResult, EpisodeResult]]]]:
     """The usual and another number of steps, and the episodes that were tried with both."""
-    usual = result.training.settings["n_action_steps"]
+    usual = result.training.n_action_steps
     newest = {e.n_action_steps: e for e in result.evaluations if e.step == result.evaluations[-1].step}
     if usual not in newest:
         return

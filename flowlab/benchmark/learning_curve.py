@@ -23,7 +23,7 @@ class CurvePoint(Settings):
 
 def learning_curve(result: PolicyResult) -> Iterator[CurvePoint]:
     """The points of a policy whose earlier checkpoints were evaluated too, task by task."""
-    usual = result.training.settings["n_action_steps"]
+    usual = result.training.n_action_steps
     steps = {e.step: by_trial(e.outcomes) for e in result.evaluations if e.n_action_steps == usual and e.outcomes}
     if len(steps) < 2:
         return

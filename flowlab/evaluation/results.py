@@ -3,8 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pydantic import model_validator
+
 from flowlab.config import Settings
 from flowlab.evaluation.trials import Trial
+from flowlab.text import shown
 
 
 class RolloutFlowError(Settings):
@@ -97,6 +100,18 @@ class TrainingRecord(Settings):
     versions: Mapping[str, str]
     processor: str
 
+    @model_validator(mode="after")
+    def _says_its_action_steps(self) -> "TrainingRecord":
+        if type(steps := self.settings.get("n_action_steps")) is not int:
+            raise ValueError(f"settings: n_action_steps is {shown(steps)}, expected a number of steps")
+        return self
+
+    @property
+    def n_action_steps(self) -> int:
+        """Steps of every plan that the policy was trained to execute."""
+        steps: int = self.settings["n_action_steps"]
+        return steps
+
 
 class PolicyResult(Settings):
     """A policy, its training and its evaluations."""
@@ -114,7 +129,7 @@ class PolicyResult(Settings):
     def final(self) -> Sequence[EpisodeResult]:
         """The episodes of the newest weights, executing what the policy was trained to execute."""
         newest = [e for e in self.evaluations if e.step == self.evaluations[-1].step]
-        usual = [e for e in newest if e.n_action_steps == self.training.settings["n_action_steps"]]
+        usual = [e for e in newest if e.n_action_steps == self.training.n_action_steps]
         return (usual or newest)[-1].outcomes
 
     @property

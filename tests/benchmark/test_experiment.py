@@ -22,6 +22,7 @@ from trained_runs import NETWORK, header_of, lines_of, make_run, options, policy
 
 from flowlab.benchmark.recipe import load_experiment
 from flowlab.benchmark.units import plan_units
+from flowlab.checksums import with_checksum
 from flowlab.cli import main
 from flowlab.storage.dataset import Dataset
 
@@ -249,7 +250,11 @@ def test_other_episodes_than_were_tried_are_not_passed_over(
 def test_a_damaged_unit_is_said(experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture) -> None:
     out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
     place = out / f"units/{UNITS[2]}.json"
-    for text, sentence in (("{", "not valid JSON"), ('{"name": "x"}', "label: Field required")):
+    values = {k: v for k, v in json.loads(place.read_text()).items() if k != "sha256"}
+    values["training"]["settings"]["n_action_steps"] = {}
+    no_steps = "training: settings: n_action_steps is {}, expected a number of steps"
+    cases = (("{", "not valid JSON"), ('{"name": "x"}', "label: Field required"))
+    for text, sentence in (*cases, (json.dumps(with_checksum(values)), no_steps)):
         place.write_text(text)
         code, said, err = bench(capsys, out, recipe)
         assert (code, said) == (3, "")
