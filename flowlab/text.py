@@ -6,8 +6,12 @@ import reprlib
 
 from flowlab.limits import MAX_SHOWN
 
-_UNPRINTABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Controls, terminal escapes, turns of the writing direction and halves of characters; not the end of a line."""
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x09\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+    r"\ud800-\udfff\U000e0000-\U000e007f]"
+)
+"""Controls, terminal escapes, turns of the writing direction, what is not seen, halves of characters; not the end of a
+line, nor what joins letters."""
 _MARKUP = re.compile(r"[\\`*_\[\]<>|&~$#!]")
 _LONGEST_NAME = 150
 """Bytes; file systems take 255, and a file in the making has a longer name."""

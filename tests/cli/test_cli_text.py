@@ -29,6 +29,7 @@ HOSTILE = (
     ":smile:",
     "a\nfake: line",
     "\u202egnp",
+    "\u061cgnp\u200b",
     "x" * 5000,
     "_hidden",
     "\ud800",
@@ -43,7 +44,7 @@ def test_text_on_the_terminal_is_what_it_is(text: str, capsys: pytest.CaptureFix
     with console.ProgressBar(quiet=False) as bar:
         bar.update(1, 1, text, text)
     out, err = capsys.readouterr()
-    assert not re.search("[\x1b\u202e\ud800]", out + err)
+    assert not re.search("[\x1b\u202e\u061c\u200b\ud800]", out + err)
     assert [line[:4] for line in out.splitlines()[:1]] == ["echo"]
     assert len(err.splitlines()) == 2
     if text == "[/red]":
