@@ -110,7 +110,7 @@ def make_recorded(seed: int, steps: int = 24) -> Episode:
     episode = with_quality(make_episode(seed, task="pour", steps=steps, queries=12, object_pose=False), seed)
     assert episode.tracks.quality is not None
     wander = 0.01 * rng.normal(size=(steps, 3)).cumsum(0)
-    hand = episode.point_cloud[:, 0] + [0, 0, 0.02] + 0.1 * (wander - wander[0])
+    hand = episode.point_cloud[:, 0] + 0.1 * (wander - wander[0])  # it holds the ball there, and turns with it
     turn = np.tile([1.0, 0, 0, 0], (steps, 1)) + 0.05 * rng.normal(size=(steps, 4))
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     state = np.concatenate([hand, turn, rng.uniform(0, 0.08, (steps, 1))], 1).astype(np.float32)
