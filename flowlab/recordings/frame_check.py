@@ -13,7 +13,7 @@ from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.poses import check_known, poses_at
 from flowlab.recordings.repeats import find_repeats
-from flowlab.recordings.sync import nearest_sample, sampling_rate
+from flowlab.recordings.sync import nearest_sample
 from flowlab.recordings.verdicts import Check
 
 _NEAR = 0.55
@@ -224,8 +224,10 @@ def _stale(name: str, off_state: Mapping[str, np.ndarray], k: int, max_state_s: 
 
 def _half(stream: ImageStream | SampleStream) -> float:
     """Half an interval of a stream, and as much more as intervals vary [s]; farther away is another frame's."""
-    rate = sampling_rate(stream.time_s)
-    return _NEAR / rate if 0 < rate < np.inf else np.inf
+    steps = np.diff(stream.time_s)
+    steps = steps[steps > 0]
+    # Not the median: where a third of the frames is lost, that is two of them.
+    return _NEAR * float(np.quantile(steps, 0.2)) if len(steps) else np.inf
 
 
 def _ms(seconds: float) -> str:
