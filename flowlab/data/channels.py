@@ -120,16 +120,16 @@ def _motions(buffer: ReplayBuffer, episode: EpisodeSlice) -> Iterator[bool]:
 
 def _off_way(then: np.ndarray, now: np.ndarray, gripper: np.ndarray, way: np.ndarray) -> float:
     """How far from its way points take a gripper with them [m]: all as they move, or as a body that turns."""
+    from flowlab.tracking.trackers.rigid_bodies.rigid_motion import fit_rigid  # with which Numba is loaded
+
     if not len(then):
         return float("inf")
     alike = float(np.median(np.linalg.norm(now - then - way, axis=1)))
     if len(then) < _BODY:  # they turn about an axis that is not known, but stay as far away
         before, after = np.linalg.norm(then - gripper, axis=1), np.linalg.norm(now - gripper - way, axis=1)
         return alike if len(then) == 1 else min(alike, float(np.abs(after - before).max()))
-    middle, moved = then.mean(0), now.mean(0)
-    u, _, v = np.linalg.svd((then - middle).T @ (now - moved))
-    R = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ v))]) @ v).T
-    return min(alike, float(np.linalg.norm(R @ (gripper - middle) + moved - gripper - way)))
+    R, t = fit_rigid(then, now, np.ones(len(then)), refinements=0)
+    return min(alike, float(np.linalg.norm(R @ gripper + t - gripper - way)))
 
 
 def _actions_are_positions(buffer: ReplayBuffer) -> bool:

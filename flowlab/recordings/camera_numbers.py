@@ -55,16 +55,14 @@ def _poses(name: str, values: np.ndarray, known: Metadata) -> str | None:
     if T is None:
         return None
     if len(T) > 1 and not np.allclose(T, T[:1], rtol=0, atol=1e-6):
-        return (f"it has {len(T)} rigid transforms that change; if they are the poses of a camera that moves, "
-                f"each camera to "
-                f"world, write 'T_world_cam_file' into {FILE_NAME}")  # fmt: skip
+        return (f"it has {len(T)} rigid transforms that change; if they are the poses of a camera that moves, each "
+                f"camera to world, write 'T_world_cam_file' into {FILE_NAME}")  # fmt: skip
     used = np.eye(4) if known.T_world_cam is None else np.array(known.T_world_cam)
     if np.allclose(T[0], used, rtol=0, atol=1e-3) or np.allclose(T[0], np.eye(4), rtol=0, atol=1e-6):
         return None
     other = "" if known.T_world_cam is None else ", which is not the T_world_cam that is used"
     return (f"it has a rigid transform{other}; if it is the pose of the camera, camera to world, write it as "
-            f"'T_world_cam' "
-            f"into {FILE_NAME}")  # fmt: skip
+            f"'T_world_cam' into {FILE_NAME}")  # fmt: skip
 
 
 def _rigid(values: np.ndarray, called: bool) -> np.ndarray | None:
@@ -94,14 +92,13 @@ def _intrinsics(name: str, values: np.ndarray, known: Metadata) -> str | None:
     if (at[:, :2] <= 1).any() and (at[:, 2:] == 0).all():  # a rotation about the axis, or a scale
         return None
     if np.abs(every - every[0]).max() > _SAME * at[0, 0]:
-        return ("it has camera matrices that change from step to step, and one camera is expected; cut the "
-                "recording where "
-                f"they change, with 'intrinsics' in {FILE_NAME}")  # fmt: skip
+        return ("it has camera matrices that change from step to step, and one camera is expected; cut the recording "
+                f"where they change, with 'intrinsics' in {FILE_NAME}")  # fmt: skip
     mine = known.intrinsics
     if mine is None or np.abs(at[0] - [mine.fx, mine.fy, mine.cx, mine.cy]).max() > _SAME * max(at[0, 0], mine.fx):
-        return (f"it has a camera matrix with fx {at[0, 0]:.5g}, cx {at[0, 2]:.5g}, cy {at[0, 3]:.5g}, which is "
-                f"not the one "
-                f"that is used; if it is the color camera's, write it as 'intrinsics' into {FILE_NAME}")  # fmt: skip
+        return (f"it has a camera matrix with fx {at[0, 0]:.5g}, cx {at[0, 2]:.5g}, cy {at[0, 3]:.5g}, which is not "
+                f"the one that is used; if it is the color camera's, write it as "
+                f"'intrinsics' into {FILE_NAME}")  # fmt: skip
     return None
 
 

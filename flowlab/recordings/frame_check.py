@@ -143,8 +143,9 @@ def check_frames(
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))
     repeated = {name: repeated_pictures(kept) for name, kept in zip(("color", "depth"), digests, strict=True)}
     return FrameCheck(
-        rows[:, 0], rows[:, 1], tuple(bad), len(frames), color_size, depth_size, median, sync, checks, samples,
-        np.array(skipped, np.int64), repeated, T_world_cam,
+        color=rows[:, 0], depth=rows[:, 1], bad=tuple(bad), looked_at=len(frames), color_size=color_size,
+        depth_size=depth_size, median_counts=median, sync_s=sync, checks=checks, samples=samples,
+        skipped=np.array(skipped, np.int64), repeated=repeated, T_world_cam=T_world_cam,
     )  # fmt: skip
 
 

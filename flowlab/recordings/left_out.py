@@ -60,25 +60,10 @@ def _is_used(name: str, used: set[str]) -> bool:
 
 def _used(source: "ParsedRecording") -> set[str] | None:
     """The files that are used, by their names below the folder; None where that is not known."""
-    known, path = source.metadata, source.path
-    used = {FILE_NAME}
+    known, used = source.metadata, {FILE_NAME}
     used |= {f for f in (known.times, known.depth_times, known.state, known.state_times, known.action,
                          known.action_times, known.T_world_cam_file, known.T_world_cam_times) if f}  # fmt: skip
-    if source.streams.used is not None:
-        return used | set(source.streams.used)
-    if source.reader.name not in ("plain", "tum"):
-        return None
-    used |= {"intrinsic.json", "camera_intrinsic.json", "rgb.txt", "depth.txt", "ground_truth.npz"}
-    if source.reader.name == "tum":
-        used |= {"associations.txt", "associated.txt", "associate.txt", "groundtruth.txt"}
-    pictures = (*source.streams.color.names, *source.streams.depth.names)
-    folders = [Path(f) for f in (known.color, known.depth)]
-    for name in pictures:
-        used.add(name)
-        used |= {(f / Path(name).name).as_posix() for f in folders if f.name == Path(name).parent.name}
-        if Path(name).parent.name == path.name:  # pictures that lie in the recording's own folder
-            used.add(Path(name).name)
-    return used
+    return None if source.streams.used is None else used | set(source.streams.used)
 
 
 def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
@@ -92,15 +77,15 @@ def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
                 f"{cut(file.name)} is not used; if it is the {what}, write '{what}: {cut(file.name)}' into {FILE_NAME}"
             )
             return Check(what, Verdict.DOUBTFUL, says)
-    if (asked := _of_rows(source, file)) is not None:
+    values = _values(file.path)
+    if (asked := _of_rows(source, file, values)) is not None:
         return asked
-    why = _of_camera(source, file)
+    why = _of_camera(source, file, values)
     return None if why is None else Check("camera", Verdict.DOUBTFUL, f"{cut(file.name)} is not used; {why}")
 
 
-def _of_rows(source: "ParsedRecording", file: FoundFile) -> Check | None:
+def _of_rows(source: "ParsedRecording", file: FoundFile, values: np.ndarray | None) -> Check | None:
     """A doubt about a file with numbers for every picture, which may be the robot's; None where it has none."""
-    values = _values(file.path)
     steps = {len(source.streams.color), len(source.streams.depth)}
     if values is None or values.ndim != 2 or len(values) not in steps or called_poses(Path(file.name).stem.lower()):
         return None
@@ -112,18 +97,16 @@ def _of_rows(source: "ParsedRecording", file: FoundFile) -> Check | None:
     return Check("state", Verdict.DOUBTFUL, f"{says} 'state: {name}' into {FILE_NAME}")
 
 
-def _of_camera(source: "ParsedRecording", file: FoundFile) -> str | None:
+def _of_camera(source: "ParsedRecording", file: FoundFile, values: np.ndarray | None) -> str | None:
     """What is said of a file that may have numbers of the camera; None where it has none."""
     name, posed = Path(file.name), source.streams.poses is not None
-    values = _values(file.path)
     says = None if values is None else camera_numbers(name.stem, values, source.metadata, posed)
     if says is not None or (values is not None and values.shape[-2:] in ((4, 4), (3, 4), (3, 3))):
         return says
     if posed or not called_poses(name.stem):
         return None
-    return (f"if it has poses of a camera that moves, each camera to world, write 'T_world_cam_file: "
-            f"{cut(file.name)}' into "
-            f"{FILE_NAME}, if one of a camera that stands still, that as 'T_world_cam'")  # fmt: skip
+    return (f"if it has poses of a camera that moves, each camera to world, write 'T_world_cam_file: {cut(file.name)}' "
+            f"into {FILE_NAME}, if one of a camera that stands still, that as 'T_world_cam'")  # fmt: skip
 
 
 def _values(path: Path) -> np.ndarray | None:
@@ -152,9 +135,8 @@ def _pose_folders(source: "ParsedRecording", files: list[FoundFile]) -> tuple[li
         values = _values(found[0].path)
         if values is None or camera_numbers("poses", values, Metadata(), False) is None:
             continue
-        says = (f"{cut(folder)}/ has {len(found)} files with a rigid transform each, and is not used; if they "
-                f"are the poses of "
-                f"the camera, write them, camera to world, into one file, named as 'T_world_cam_file' in "
+        says = (f"{cut(folder)}/ has {len(found)} files with a rigid transform each, and is not used; if they are the "
+                f"poses of the camera, write them, camera to world, into one file, named as 'T_world_cam_file' in "
                 f"{FILE_NAME}")  # fmt: skip
         asked.append(Check("camera", Verdict.DOUBTFUL, says))
         left = [file for file in left if file not in found]

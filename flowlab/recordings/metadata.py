@@ -15,6 +15,8 @@ from flowlab.text import cut, is_path_inside, shown
 from flowlab.untrusted import read_yaml
 
 FILE_NAME = "recording.yaml"
+TRUE_TRACKS = "ground_truth.npz"
+"""What grading compares with, where a recording has it."""
 _FARTHEST_M = 1e6
 Row = tuple[float, float, float, float]
 

@@ -203,7 +203,8 @@ def _with_one_pose(path: Path, streams: Streams, said: Metadata) -> Streams:
         raise DataError(f"{path}: T_world_cam says that the camera stands still, and T_world_cam_file that it moves; "
                         f"leave one of them out of {_write_to(path)}")  # fmt: skip
     if streams.poses is None:
-        of_poses = [f"T_world_cam_{x}" for x in ("times", "offset_s", "gap_s") if getattr(said, f"T_world_cam_{x}")]
+        of_poses = [f"T_world_cam_{x}" for x in ("times", "offset_s", "gap_s")
+                    if getattr(said, f"T_world_cam_{x}") is not None]  # fmt: skip
         if of_poses:
             raise DataError(f"{path}: '{of_poses[0]}' is said, but there are no poses that it could be said of; name "
                             f"them with 'T_world_cam_file' in {_write_to(path)}")  # fmt: skip

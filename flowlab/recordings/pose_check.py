@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from flowlab.errors import DataError
-from flowlab.geometry.transforms import apply, inverse, rigid
+from flowlab.geometry.transforms import apply, rigid
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.frame_processing import FrameProcessor
+from flowlab.recordings.pose_readings import READINGS
 from flowlab.recordings.poses import poses_at
 from flowlab.recordings.verdicts import Check, Verdict
 
@@ -45,16 +46,9 @@ _SHIFTED = 0.6
 _SHIFT_M = 0.003
 """And by no less than this [m]."""
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
-_OPENGL = np.diag([1.0, -1, -1, 1])
-_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From x right, y down, z forward to the axes of a robot's body: x forward, y left, z up."""
 _READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "the inverse, world to camera": inverse,
-    "in OpenGL's axes (y up, z backward)": lambda T: T @ _OPENGL,
-    "the inverse, in OpenGL's axes": lambda T: inverse(T) @ _OPENGL,
-    "the inverse of those in OpenGL's axes": lambda T: inverse(T @ _OPENGL),
+    **READINGS,
     "in millimeters": lambda T: rigid(T[:, :3, :3], T[:, :3, 3] / 1000),
-    "those of a body (x forward, y left, z up)": lambda T: T @ _BODY,
 }
 
 
@@ -108,7 +102,7 @@ def _judged(source: "ParsedRecording", pairs: list[_Pair], off: float, fixed: fl
     how = min(others, key=lambda k: others[k])
     if others[how] < min(_BETTER * off, _EXPLAINED * fixed):
         return Verdict.REFUSED, (
-            f", within {1000 * others[how]:.1f} mm if they were {how}: T_world_cam must map coordinates of the camera "
+            f", within {1000 * others[how]:.1f} mm if each were {how}: T_world_cam must map coordinates of the camera "
             "(x right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
     worse = off > _EXPLAINED * fixed
     why = "they explain too little of it" if worse else "that is more than sensors err by"

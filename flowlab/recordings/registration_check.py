@@ -38,7 +38,6 @@ _CLEAR, _CLEAR_SHARE = 40.0, 0.03
 """A gradient of a smoothed picture, by Sobel, is no noise beyond this; so many pixels have one, or all is dim."""
 _SHARE = (0.012, 0.03)
 """Likewise, the worst corner is this far off, of the picture's width."""
-_SEVERITY = list(Verdict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +173,7 @@ def check_registration(source: "ParsedRecording") -> Check:
             advice = "correct 'depth_intrinsics' or 'T_color_depth' in"
         elif turned:
             advice = "turn the pictures themselves, as depth is, and remove that note; intrinsics are those in"
-        return Check("registration", max(verdict, Verdict.DOUBTFUL, key=_SEVERITY.index),
+        return Check("registration", max(verdict, Verdict.DOUBTFUL, key=lambda v: v.severity),
                      f"{how}{says}{turned}; {advice} {source.write_to}")  # fmt: skip
     return Check("registration", verdict, f"{how}{says}{turned and f'{turned}, and is taken as it is stored'}")
 

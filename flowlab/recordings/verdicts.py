@@ -23,6 +23,11 @@ class Verdict(StrEnum):
     REFUSED = "refused"
     """It cannot be as it is said, or is not known and must be: the recording is not used."""
 
+    @property
+    def severity(self) -> int:
+        """From 0 on, the more the worse."""
+        return list(Verdict).index(self)
+
 
 @dataclass(frozen=True, slots=True)
 class Check:
@@ -58,6 +63,11 @@ def stored_checks(extras: Mapping[str, Any]) -> tuple[Check, ...] | None:
         return tuple(map(Check.from_json, extras[CHECKS]))
     except (KeyError, TypeError, ValueError):
         return None
+
+
+def worst_first(checks: Iterable[Check]) -> list[Check]:
+    """The checks, those with the worst verdicts first."""
+    return sorted(checks, key=lambda check: -check.verdict.severity)
 
 
 def raise_refused(path: object, checks: Iterable[Check]) -> None:

@@ -1,6 +1,6 @@
 """Whether the pose of the camera can be what it is said to be: a table is level, and is seen from above."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from flowlab.errors import DataError
-from flowlab.geometry.transforms import inverse
 from flowlab.recordings.lens import undistorted_rays
+from flowlab.recordings.pose_readings import READINGS
 from flowlab.recordings.verdicts import Check, Verdict
 
 if TYPE_CHECKING:
@@ -30,17 +30,6 @@ _LEVEL_DEG = 8.0
 _TILTED_DEG = 20.0
 """A plane that is tilted by more against every axis of the world is neither a table nor a wall."""
 _TRIES = 150
-_OPENGL = np.diag([1.0, -1, -1, 1])
-_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_OTHERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "the inverse, world to camera": inverse,
-    "in OpenGL's axes (y up, z backward)": lambda T: T @ _OPENGL,
-    "the inverse, in OpenGL's axes": lambda T: inverse(T) @ _OPENGL,
-    "the inverse of one in OpenGL's axes": lambda T: inverse(_OPENGL @ T),
-    "that of a body (x forward, y left, z up)": lambda T: T @ _BODY,
-    "the inverse of a body's (x forward, y left, z up)": lambda T: inverse(T) @ _BODY,
-}
-"""What ``T_world_cam`` would be if it were meant otherwise."""
 _UNITS = {"centimeters": 100.0, "millimeters": 1000.0}
 _NEAR_M = (0.2, 5.0)
 """A camera is this far from the world's origin in the unit that is meant."""
@@ -113,7 +102,7 @@ def _judged(T: np.ndarray, plane: _Plane | None, stands: str, write_to: str) -> 
     if plane is None:
         return Check("world", Verdict.ASSUMED, f"{stands}; no plane in the cloud tells whether that is so")
     stands = f"{stands}; the plane with {plane.share:.0%} of the points, {plane.distance_m:.2f} m from the camera,"
-    better = [(how, other) for how, read in _OTHERS.items() if _tilt(other := read(T), plane) < _LEVEL_DEG]
+    better = [(how, other) for how, read in READINGS.items() if _tilt(other := read(T), plane) < _LEVEL_DEG]
     if _tilt(T, plane) >= _LEVEL_DEG:
         return _tilted(T, plane, stands, [how for how, _ in better], write_to)
     height = T[2, 3] - plane.distance_m * float(T[2, :3] @ plane.normal)

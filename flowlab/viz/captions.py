@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from flowlab.geometry.moving import MOVING_IN_EPISODE_M
-from flowlab.recordings.verdicts import Verdict, stored_checks
+from flowlab.recordings.verdicts import stored_checks, worst_first
 from flowlab.records import Episode, PositionSource, Role
 from flowlab.text import markdown
 from flowlab.viz.colors import SIGMA_LIMIT
@@ -93,9 +93,7 @@ def describe_checks(episode: Episode) -> str:
     checks = stored_checks(episode.extras)
     if checks is None:
         return "The recording was not checked: it was labeled by an earlier flowlab."
-    order = list(Verdict)
-    told = sorted(checks, key=lambda check: -order.index(check.verdict))
-    lines = [f"| {c.verdict} | {markdown(c.about)} | {markdown(c.says)} |" for c in told]
+    lines = [f"| {c.verdict} | {markdown(c.about)} | {markdown(c.says)} |" for c in worst_first(checks)]
     return "\n".join(["| verdict | about | what was found |", "|---|---|---|", *lines])
 
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from flowlab.perception.observer import Box
 from flowlab.recordings.preview import PicturePreview, RecordingPreview, StreamPreview
 from flowlab.recordings.sync import sampling_rate
-from flowlab.recordings.verdicts import Check, Verdict
+from flowlab.recordings.verdicts import Check, Verdict, worst_first
 from flowlab.viz.cloud_from_above import draw_cloud_from_above
 from flowlab.viz.plot_style import (
     ALARM,
@@ -49,8 +49,6 @@ _MOST_MARKS = 2500
 """Samples of a stream that are nearer to each other than the axis can show are drawn as one."""
 _EDGE_RGB = (255, 40, 200)
 _COLORS = {Verdict.REFUSED: ALARM, Verdict.DOUBTFUL: ORANGE, Verdict.ASSUMED: BLUE, Verdict.OK: GREEN}
-_ORDER = tuple(reversed(Verdict))
-"""The worst first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +154,7 @@ def _draw_picture(axes: Axes, picture: PicturePreview) -> None:
 def _rows(checks: Sequence[Check], problem: str | None, width: int) -> Iterator[_Row]:
     """What is said of the checks, the worst first, in lines of so many characters, as much as there is room for."""
     refused = [c.says for c in checks if c.verdict is Verdict.REFUSED]
-    told = sorted(checks, key=lambda c: _ORDER.index(c.verdict))
+    told = worst_first(checks)
     if problem and not any(says in problem for says in refused):
         told.insert(0, Check("problem", Verdict.REFUSED, problem))
     room = _MOST_LINES

@@ -11,8 +11,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.file_stamps import read_names
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
-from flowlab.recordings.metadata import FILE_NAME, Metadata, load_metadata
-from flowlab.recordings.readers.open3d_json import open3d_calibration
+from flowlab.recordings.metadata import FILE_NAME, TRUE_TRACKS, Metadata, load_metadata
+from flowlab.recordings.readers.open3d_json import FILES, open3d_calibration
 from flowlab.recordings.sample_files import load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.writing import write_rgbd_recording
@@ -48,15 +48,17 @@ def read_folder(path: Path, given: Metadata, fps: float | None, known: tuple[tup
     """The streams of a folder with two folders of pictures."""
     color = _list(path, "color", given.color, COLOR_SUFFIXES)
     depth = _list(path, "depth", given.depth, DEPTH_SUFFIXES)
+    used = (TRUE_TRACKS, *FILES, *(f.relative_to(path).as_posix() for f in (*color, *depth)))
     if given.times is not None:
         color_stamps = _listed(path / given.times, color)
         own = given.depth_times is not None
         depth_stamps = _listed(path / given.depth_times, depth) if own else _shared(path, given, color, depth)  # type: ignore[operator]
-        return Streams(color_stream(color, *color_stamps), depth_stream(depth, *depth_stamps), known=known)
+        return Streams(color_stream(color, *color_stamps), depth_stream(depth, *depth_stamps), known=known, used=used)
     return Streams(
         color_stream(*read_names(color, f"the names in {given.color}/")),
         depth_stream(*read_names(depth, f"the names in {given.depth}/")),
         known=known,
+        used=used,
     )
 
 

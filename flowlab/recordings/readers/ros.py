@@ -89,9 +89,9 @@ def _unused(bag: RosBag, topics: ChosenTopics) -> list[Check]:
     says = ", ".join(f"{topic} ({kind.rpartition('/')[2]})" for topic, kind in kinds.items())
     poses = [topic for topic, kind in kinds.items() if kind in POSES]
     if poses and topics.state is None and topics.T_world_cam is None:
-        says = (f"{cut(', '.join(poses))} hold poses and are not used; if one is the state, or the pose of a "
-                f"camera that moves, "
-                f"write 'topics: {{state: {poses[0]}}}' or 'topics: {{T_world_cam: {poses[0]}}}'")  # fmt: skip
+        says = (f"{cut(', '.join(poses))} hold poses and are not used; if one is the state, or the pose of a camera "
+                f"that moves, write 'topics: {{state: {poses[0]}}}' or "
+                f"'topics: {{T_world_cam: {poses[0]}}}'")  # fmt: skip
         return [Check("unused topics", Verdict.DOUBTFUL, says)]
     return [Check("unused topics", Verdict.OK, cut(says, 600) or "every topic is used")]
 

@@ -10,7 +10,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.metadata import TRUE_TRACKS, Metadata
 from flowlab.recordings.poses import pose_stream, read_poses
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
@@ -18,6 +18,7 @@ from flowlab.text import is_path_inside, shown
 from flowlab.untrusted import read_text
 
 GROUND_TRUTH = "groundtruth.txt"
+LISTS = ("rgb.txt", "depth.txt")
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt")
 DEPTH_FACTOR = 5000
 """Counts per meter of the benchmark's depth pictures."""
@@ -52,7 +53,7 @@ class TUMReader:
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams; both lists where there are, else the pairs of the associations."""
         if _both(path):
-            lists = ["rgb.txt", "depth.txt"]
+            lists = [*LISTS]
             color, depth = (_entries(path / name, 2) for name in lists)
         else:
             file = _associations(path)
@@ -75,6 +76,13 @@ class TUMReader:
             known=tuple(known),
             registered=True,
             checks=checks,
+            used=(
+                *LISTS,
+                *ASSOCIATIONS,
+                GROUND_TRUTH,
+                TRUE_TRACKS,
+                *(Path(entry[1]).as_posix() for entry in (*color, *depth)),
+            ),
             poses=poses,
         )
 
@@ -99,7 +107,7 @@ def _ground_truth(file: Path) -> tuple[SampleStream | None, tuple[Check, ...]]:
 
 def _both(path: Path) -> bool:
     """Whether both lists are there."""
-    return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+    return all((path / name).is_file() for name in LISTS)
 
 
 def _associations(path: Path) -> Path | None:
