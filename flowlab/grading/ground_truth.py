@@ -8,11 +8,12 @@ from jaxtyping import Bool, Float32, Int8
 
 from flowlab.array_files import load_arrays
 from flowlab.errors import DataError, MissingFileError
+from flowlab.recordings.metadata import TRUE_TRACKS
 from flowlab.records import Role
 from flowlab.text import cut, natural_key, shown
 from flowlab.untrusted import read_json
 
-FILE_NAME = "ground_truth.npz"
+FILE_NAME = TRUE_TRACKS
 MADE_WITH = "simulated.json"
 """In a simulated recording's folder: what it was made with, and how many queries could not be used."""
 

@@ -13,7 +13,7 @@ from flowlab.errors import DataError, UsageError
 from flowlab.files import new_folder
 from flowlab.geometry.camera import Camera, pose_fault
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.metadata import FILE_NAME, TRUE_TRACKS
 
 _POSES = "T_world_cam.npy"
 _MAX_COUNT = np.iinfo(np.uint16).max
@@ -85,7 +85,7 @@ def write_rgbd_recording(
             about = _yaml(camera, list(samples), float(depth_unit_m), success, task, moves=poses is not None)
             (temporary / FILE_NAME).write_text(about)
             if query_px is not None:
-                np.savez_compressed(temporary / "ground_truth.npz", **known)
+                np.savez_compressed(temporary / TRUE_TRACKS, **known)
     except OSError as error:
         raise DataError(f"{folder}: the recording cannot be written ({error.strerror or error})") from error
 

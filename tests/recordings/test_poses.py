@@ -231,7 +231,7 @@ LATE = np.stack([pose(t - 0.3) for t in CLOCK])
     ("T", "verdict", "words"),
     [
         (looking((2.0, 1, 1)) @ POSES, "ok", "it moves: under its poses the scene stays within"),
-        (inverse(POSES), "refused", "if they were the inverse, world to camera"),
+        (inverse(POSES), "refused", "if each were the inverse, world to camera"),
         (POSES @ OPENGL, "refused", "in OpenGL's axes"),
         (inverse(POSES @ OPENGL), "refused", "the inverse, in OpenGL's axes"),
         (POSES @ inverse(BODY), "refused", "that of a body"),
