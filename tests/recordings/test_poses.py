@@ -3,7 +3,6 @@
 The scene is filmed by ray casting, so where everything truly is follows from the poses and nothing else.
 """
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dry_runs import dry_run
 from filmed_scenes import FLOOR, TABLE, THINGS, WALL, Box, film, looking
 from real_recordings import write_png, write_yaml
 from scipy.spatial.transform import Rotation
@@ -165,11 +165,10 @@ LAYOUTS: dict[str, Callable[[Path, Frames], Path]] = {
 }
 
 
-def dry_run(capsys: Capture, path: Path) -> tuple[int, dict[str, tuple[str, str]], str, dict[str, Any]]:
+def looked_at(capsys: Capture, path: Path) -> tuple[int, dict[str, tuple[str, str]], str, dict[str, Any]]:
     """Exit code, what came of each thing that was looked at, the problem, and all facts."""
-    code, out, err = call_cli(capsys, "track-real", path, "--dry-run", "--json", "--tracker", "lucas-kanade")
-    facts = json.loads(out)["recordings"][0] if out.startswith("{") else {"problem": err}
-    return code, {c["about"]: (c["verdict"], c["says"]) for c in facts.get("checks", [])}, str(facts["problem"]), facts
+    run = dry_run(capsys, path)
+    return run.code, run.checks, run.problem, run.facts
 
 
 def labeled(capsys: Capture, path: Path, out: Path, *more: str, tracker: str = "lucas-kanade") -> Episode:
@@ -197,7 +196,7 @@ def errors_mm(e: Episode, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_labels_are_in_the_world(frames: Frames, tmp_path: Path, capsys: Capture, layout: str) -> None:
     path = LAYOUTS[layout](tmp_path / "in", frames)
-    code, found, problem, _ = dry_run(capsys, path)
+    code, found, problem, _ = looked_at(capsys, path)
     assert (code, problem) == (0, "None")
     assert {v for v, _ in found.values()} <= {"ok", "assumed"}, found
     assert found["camera"][0] == "ok", found["camera"]
@@ -212,7 +211,7 @@ def test_labels_are_in_the_world(frames: Frames, tmp_path: Path, capsys: Capture
 
 
 def test_without_poses_it_is_doubtful_and_said_what_to_give(frames: Frames, tmp_path: Path, capsys: Capture) -> None:
-    code, found, _, _ = dry_run(capsys, put(tmp_path / "r", frames))
+    code, found, _, _ = looked_at(capsys, put(tmp_path / "r", frames))
     assert (code, found["camera"][0]) == (0, "doubtful")
     assert "it moves, and is taken as fixed" in found["camera"][1]
     assert "'T_world_cam_file: ...'" in found["camera"][1]
@@ -246,7 +245,7 @@ LATE = np.stack([pose(t - 0.3) for t in CLOCK])
 def test_poses_that_are_not_the_cameras_are_refused(
     frames: Frames, tmp_path: Path, capsys: Capture, T: np.ndarray, verdict: str, words: str
 ) -> None:
-    code, found, problem, _ = dry_run(capsys, put(tmp_path / "r", frames, T))
+    code, found, problem, _ = looked_at(capsys, put(tmp_path / "r", frames, T))
     assert found["camera"][0] == verdict, found["camera"]
     assert re.search(words, found["camera"][1]), found["camera"]
     assert code == (3 if verdict == "refused" else 0), problem
@@ -258,7 +257,7 @@ def test_poses_of_a_slow_camera_are_tested_over_longer(
 ) -> None:
     T = np.stack([looking((0.012 * t, -0.85, 0.65), (0.012 * t, 0.1, 0.05)) for t in range(24)])
     shots = [film((TABLE, WALL, FLOOR, *THINGS), K, SIZE, one, seed=k) for k, one in enumerate(T)]
-    found = dry_run(capsys, put(tmp_path / "r", shots, read(T)))
+    found = looked_at(capsys, put(tmp_path / "r", shots, read(T)))
     assert (found[0], found[1]["camera"][0]) == (code, verdict), found[1]["camera"]
 
 
@@ -267,12 +266,12 @@ def test_poses_of_another_clock_are_shifted_as_said(frames: Frames, tmp_path: Pa
     path = put(tmp_path / "r", frames, T_world_cam_file="T.txt", time_unit="s", times="times.txt", fps=None)
     (path / "times.txt").write_text("".join(f"{100 + t:.3f}\n" for t in CLOCK))
     (path / "T.txt").write_text(tum_lines(100.3 + own, np.stack([pose(t) for t in own])))
-    code, found, problem, _ = dry_run(capsys, path)
+    code, found, problem, _ = looked_at(capsys, path)
     assert (code, found["camera"][0]) == (3, "refused")
     assert "'T_world_cam_offset_s: -0.3'" in problem
     text = (path / "recording.yaml").read_text() + "T_world_cam_offset_s: -0.3\n"
     (path / "recording.yaml").write_text(text)
-    code, found, problem, _ = dry_run(capsys, path)
+    code, found, problem, _ = looked_at(capsys, path)
     assert (code, found["camera"][0]) == (0, "ok"), problem
 
 
@@ -284,7 +283,7 @@ def test_frames_without_a_pose_are_left_out_and_counted(frames: Frames, tmp_path
     path = put(tmp_path / "r", frames, T_world_cam_file="T.txt", times="times.txt", fps=None)
     (path / "times.txt").write_text("".join(f"{100 + t:.3f}\n" for t in CLOCK))
     (path / "T.txt").write_text(tum_lines(100 + CLOCK[known], POSES[known]))
-    code, found, problem, facts = dry_run(capsys, path)
+    code, found, problem, facts = looked_at(capsys, path)
     assert (code, problem, found["camera"][0]) == (0, "None", "ok")
     ((name, why),) = facts["bad_frames"]
     assert name.endswith("0006.png")
@@ -293,10 +292,10 @@ def test_frames_without_a_pose_are_left_out_and_counted(frames: Frames, tmp_path
     assert f"in {len(known)} of {len(CLOCK)} frames" in found["poses"][1]
     with (path / "recording.yaml").open("a") as file:
         file.write("T_world_cam_gap_s: 0.25\n")
-    code, found, _, facts = dry_run(capsys, path)
+    code, found, _, facts = looked_at(capsys, path)
     assert (code, facts["bad_frames"], found["poses"][0]) == (0, [], "ok")
     (path / "T.txt").write_text(tum_lines(100 + CLOCK[:8], POSES[:8]))
-    code, _, problem, _ = dry_run(capsys, path)
+    code, _, problem, _ = looked_at(capsys, path)
     assert code == 3
     assert "6 of 14 frames are bad" in problem
 
@@ -334,7 +333,7 @@ def test_files_that_hold_no_poses_are_refused(
         (path / name).write_text(content)
     else:
         np.save(path / name, content)
-    code, _, problem, _ = dry_run(capsys, path)
+    code, _, problem, _ = looked_at(capsys, path)
     assert code in (2, 3)
     assert re.search(words, problem), problem
 
@@ -351,7 +350,7 @@ def test_files_that_hold_no_poses_are_refused(
 def test_what_is_said_of_poses_must_fit(
     frames: Frames, tmp_path: Path, capsys: Capture, keys: dict[str, Any], words: str
 ) -> None:
-    code, _, problem, _ = dry_run(capsys, put(tmp_path / "r", frames[:3], POSES[:3], **keys))
+    code, _, problem, _ = looked_at(capsys, put(tmp_path / "r", frames[:3], POSES[:3], **keys))
     assert code in (2, 3)
     assert re.search(words, problem), problem
 
@@ -363,7 +362,7 @@ def test_what_is_said_of_poses_must_fit(
 def test_a_ground_truth_that_is_none_is_told(
     frames: Frames, tmp_path: Path, capsys: Capture, text: str, words: str
 ) -> None:
-    _, found, _, _ = dry_run(capsys, put_tum(tmp_path / "r", frames, text))
+    _, found, _, _ = looked_at(capsys, put_tum(tmp_path / "r", frames, text))
     assert (found["poses"][0], found["camera"][0]) == ("doubtful", "doubtful")
     assert words in found["poses"][1]
 
@@ -376,7 +375,7 @@ def test_a_ground_truth_that_is_none_is_told(
 def test_topics_that_have_no_poses_of_the_camera_are_refused(
     frames: Frames, tmp_path: Path, capsys: Capture, topic: str, words: str
 ) -> None:
-    code, _, problem, _ = dry_run(capsys, put_ros(tmp_path / "in", frames, topics={"T_world_cam": topic}))
+    code, _, problem, _ = looked_at(capsys, put_ros(tmp_path / "in", frames, topics={"T_world_cam": topic}))
     assert code == 3
     assert re.search(words, problem), problem
 
@@ -386,7 +385,7 @@ def test_names_of_arrays_must_say_which_way_they_map(frames: Frames, tmp_path: P
     with np.load(path) as held:
         content = {k: held[k] for k in held.files if k != "T_world_cam"}
     np.savez(path, **content, extrinsics=POSES)
-    code, _, problem, _ = dry_run(capsys, path)
+    code, _, problem, _ = looked_at(capsys, path)
     assert code == 3
     assert "'extrinsics' does not say whether it maps camera to world" in problem
 
@@ -398,7 +397,7 @@ def test_what_flowlab_writes_is_read_back(frames: Frames, tmp_path: Path, capsys
     rgb, depth = zip(*frames, strict=True)
     camera = Camera(*SIZE, K, np.eye(4))
     write_rgbd_recording(tmp_path / "r", rgb=rgb, depth=depth, camera=camera, time_s=CLOCK, T_world_cam=POSES)
-    code, found, problem, _ = dry_run(capsys, tmp_path / "r")
+    code, found, problem, _ = looked_at(capsys, tmp_path / "r")
     assert (code, problem, found["camera"][0]) == (0, "None", "ok")
     e = labeled(capsys, tmp_path / "r", tmp_path / "out", "--set", "recording.every=2")
     np.testing.assert_allclose(e.T_world_cam, POSES[::2], rtol=0, atol=1e-12)

@@ -1,14 +1,13 @@
 """Situations of real users whose times were misread, through the command line; beside each a control."""
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from dry_runs import dry_run
 from real_recordings import INTRINSICS, write_png, write_yaml
-from synthetic import call_cli
 from test_ros_reader import ALIGNED, COLOR, START_NS, Messages, Say, write_bag
 
 STEPS, FPS = 20, 10
@@ -43,12 +42,11 @@ named = lambda pattern, frames: {pattern(t): t for t in frames}  # noqa: E731
 def inspect(capsys: pytest.CaptureFixture[str]) -> Inspect:
     """What a dry run says: its exit code, and what it found."""
 
-    def dry_run(path: Path, *more: str) -> tuple[int, dict[str, Any]]:
-        code, out, err = call_cli(capsys, "track-real", path, "--dry-run", "--json", *more)
-        assert "Traceback" not in err
-        return code, json.loads(out)["recordings"][0]
+    def look(path: Path, *more: str) -> tuple[int, dict[str, Any]]:
+        run = dry_run(capsys, path, *more)
+        return run.code, run.facts
 
-    return dry_run
+    return look
 
 
 def assert_fine(found: tuple[int, dict[str, Any]], doubtful: bool = False) -> dict[str, Any]:

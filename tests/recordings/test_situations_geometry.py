@@ -1,6 +1,5 @@
 """Situations of real users in which cameras, depth or poses were misread; beside each one that must pass untroubled."""
 
-import json
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -10,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from dry_runs import dry_run
 from filmed_scenes import FLOOR, SCENE, TABLE, WALL, Box, film, looking
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from real_recordings import write_png, write_yaml
-from synthetic import call_cli
 from test_ros_reader import Messages, Say, instant, write_bag
 
 from flowlab.recordings.camera_check import check_camera
@@ -48,9 +47,8 @@ def put(folder: Path, frames: Any, unit_m: float = 0.001, **keys: Any) -> Path:
 
 def verdicts(capsys: Capture, path: Path) -> tuple[int, dict[str, tuple[str, str]], str]:
     """Exit code, what came of each thing that was looked at, and the problem."""
-    code, out, err = call_cli(capsys, "track-real", path, "--dry-run", "--json", "--tracker", "lucas-kanade")
-    (facts,) = json.loads(out)["recordings"] if out.startswith("{") else ({"checks": [], "problem": err},)
-    return code, {c["about"]: (c["verdict"], c["says"]) for c in facts["checks"]}, str(facts["problem"])
+    run = dry_run(capsys, path)
+    return run.code, run.checks, run.problem
 
 
 def test_an_untroubled_recording_has_no_doubt(

@@ -1,6 +1,5 @@
 """What the numbers of a robot are, and whose: times among them, two publishers, names that are chosen."""
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -8,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dry_runs import dry_run
 from real_recordings import INTRINSICS, STEPS, colors, counts, write_folder, write_yaml
-from synthetic import call_cli
 from test_ros_reader import START_NS, STEP_NS, Messages, Say, instant, say_camera, say_robot_and_camera, write_bag
 
 from flowlab.errors import DataError
@@ -30,10 +29,8 @@ EPOCH = 1.7e9 + T
 
 def looked_at(capsys: Capture, path: Path) -> tuple[int, dict[str, Any], Verdicts]:
     """Exit code, the facts of a dry run, and what came of each check."""
-    code, out, err = call_cli(capsys, "track-real", path, "--dry-run", "--json", "--tracker", "lucas-kanade")
-    assert "Traceback" not in err
-    (facts,) = json.loads(out)["recordings"]
-    return code, facts, {c["about"]: (c["verdict"], c["says"]) for c in facts.get("checks", [])}
+    run = dry_run(capsys, path)
+    return run.code, run.facts, run.checks
 
 
 def lines(header: str, *columns: np.ndarray, sep: str = ",", form: str = "{:.6f}") -> str:
