@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import islice
 from pathlib import Path
 
 from pydantic import Field, ValidationError, model_validator
@@ -20,6 +21,8 @@ from flowlab.text import cut, shown
 from flowlab.untrusted import read_json
 from flowlab.version import __version__
 
+_LOOKED_AT = 20
+"""Receipts of recordings that are read to learn what the numbers of a dataset are called."""
 ANEW = "the same extract or track command makes this unit anew"
 
 
@@ -163,8 +166,18 @@ def read_receipts(folder: Path) -> list[Receipt]:
 
 
 def known_row_format(folder: Path) -> RowFormat | None:
-    """What all episodes of a dataset have as state and action; None as long as there is no episode."""
-    return common_format(found for receipt in _receipts(folder) if (found := receipt.row_format))
+    """What the episodes of a dataset have as state and action; None as long as there is no episode.
+
+    Every unit asks, so that only the first of many are read: the names that any of these has. All are compared where
+    a dataset is validated and trained on (:func:`check_row_formats`).
+    """
+    known: RowFormat | None = None
+    found = ((receipt, own) for receipt in _receipts(folder) if (own := receipt.row_format))
+    for receipt, own in islice(found, _LOOKED_AT):
+        known = own.or_names_of(known)
+        if known.state_names or known.action_names or not receipt.contents:  # in simulation, numbers have no names
+            break
+    return known
 
 
 def common_format(formats: Iterable[RowFormat]) -> RowFormat | None:

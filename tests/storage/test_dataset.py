@@ -27,7 +27,7 @@ from flowlab.checksums import sha256_of
 from flowlab.errors import DataError, UsageError
 from flowlab.storage.dataset import Dataset, begin, open_dataset, summarize
 from flowlab.storage.manifest import MANIFEST
-from flowlab.storage.receipts import Receipt, Reject, StageTally, keep_receipt, shard_path
+from flowlab.storage.receipts import Receipt, Reject, RowFormat, StageTally, keep_receipt, known_row_format, shard_path
 from flowlab.storage.recorded import Recorded
 from flowlab.storage.shard import Shard, write_shard
 from flowlab.storage.validation import validate
@@ -413,3 +413,15 @@ def test_a_dataset_of_two_widths_is_told_in_a_sentence(tmp_path: Path) -> None:
         make_dataset(tmp_path / "d", [[wide], [narrow]])
     (told,) = [f for f in validate(tmp_path / "d") if "numbers a step" in f.problem]
     assert "another --out" in told.problem
+
+
+@pytest.mark.parametrize("recorded_ones", [True, False])
+def test_what_the_numbers_are_called_is_told_by_the_first_of_many(recorded_ones: bool, tmp_path: Path) -> None:
+    """Every unit asks: no more receipts are read than it takes, or many units would take their number squared."""
+    names = tuple("abcdefghi")
+    content: dict[str, Any] = {"contents": ("x",)} if recorded_ones else {}
+    (tmp_path / "receipts").mkdir()
+    keep_receipt(tmp_path, make_receipt([make_episode(0)], **content))
+    keep_receipt(tmp_path, make_receipt([make_episode(1)], **content, state_names=names))
+    (tmp_path / "receipts/roll-000002-000002.json").write_text("{")
+    assert known_row_format(tmp_path) == RowFormat(9, 4, names if recorded_ones else ())

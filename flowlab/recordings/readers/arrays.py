@@ -139,9 +139,8 @@ def _check_single(path: Path, used: dict[str, str]) -> None:
             continue
         found = [array for name in several if (array := _Store(path, {what: name}).load(what)) is not None]
         if not all(np.array_equal(found[0], other) for other in found[1:]):
-            raise DataError(f"{path}: {', '.join(several)} may all be the {what}, and are not the same; keep "
-                            f"one, or call the "
-                            "others otherwise")  # fmt: skip
+            raise DataError(f"{path}: {', '.join(several)} may all be the {what}, and are not the same; keep one, or "
+                            "call the others otherwise")  # fmt: skip
 
 
 def _members(path: Path) -> set[str]:
