@@ -38,6 +38,8 @@ class Kind:
     """How often, beside the others."""
     sealed: bool = False
     """Whether half of the inputs get right checksums again, so that what is behind them is reached."""
+    names_code: bool = False
+    """Whether such a file may name a module that lies beside it, as SECURITY.md says of recipes."""
 
 
 def change(folder: Path, of: str, rng: random.Random) -> None:
@@ -527,7 +529,7 @@ KINDS = {
         Kind("trials", _trials, _report_trials),
         Kind("dp3", _dp3, _read_dp3, share=2),
         Kind("weights", _weights, _read_weights),
-        Kind("recipe", _recipes, _load_recipes),
+        Kind("recipe", _recipes, _load_recipes, names_code=True),
         Kind("profile", _profiles, _load_profiles),
         Kind("experiment", _experiments, _plan_experiments),
         Kind("set", _nothing, _set, "nothing", share=4),
