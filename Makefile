@@ -2,6 +2,7 @@
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do command -v $$p && break; done)
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+unexport PYTHONDONTWRITEBYTECODE # images set it; each of the hundreds of processes would compile all that it imports
 
 .PHONY: demo test test-all campaigns lint format house docs wheel benchmark clean help
 
@@ -13,10 +14,10 @@ demo: .venv/run .venv/opengl ## a policy from nothing in minutes, and labels fro
 	$(BIN)/python tools/demo
 
 test: .venv/test ## the tests, below 8 minutes on 2 cores
-	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile
+	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
 
 test-all: .venv/test ## the tests, and the slow ones: all 50 tasks, other tools' readers
-	FLOWLAB_TESTS=all $(BIN)/pytest -n 2 --dist loadfile
+	FLOWLAB_TESTS=all $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 CAMPAIGN ?= --budget 1200
 campaigns: .venv/test ## kill, flip, fuzz, attack, disk: hours; see docs/reliability.md. CAMPAIGN="--seed 7 --count 50"

@@ -21,6 +21,22 @@ from flowlab.records import Episode
 settings.register_profile("flowlab", max_examples=examples(100), deadline=None)
 settings.load_profile("flowlab")
 
+_LONG = ("training", "pipeline", "tracking", "cli", "examples", "deployment", "evaluation", "grading", "sim", "storage")
+"""Rooms of which some file takes long: they come first, so that no worker is left alone with one at the end."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels of the simulator once, where several workers are about to do it at the same time."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        from flowlab.pipeline.compilation import will_compile
+
+        if will_compile(recipe := load_recipe("metaworld")):
+            recipe.pipeline().run(EpisodeRequest(task="hammer", seed=0))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.parent.name not in _LONG)
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:

@@ -64,7 +64,8 @@ def prepare(kind: Kind, sample: Path, seed: int, index: int, folder: Path) -> ra
     """Make an input, with a module that must not run beside it, or one folder up where one beside it may."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(sample, folder)
-    ((folder.parent if kind.names_code else folder) / _SENTINEL).write_text("raise SystemExit('code of the recording ran')\n")
+    sentinel = (folder.parent if kind.names_code else folder) / _SENTINEL
+    sentinel.write_text("raise SystemExit('code of the recording ran')\n")
     rng = case_rng(seed, kind.name, index)
     change(folder, kind.of, rng)
     if kind.sealed and rng.random() < 0.5:
