@@ -10,16 +10,13 @@ import numpy as np
 from flowlab.array_files import map_array, map_member
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
-from flowlab.recordings.camera_numbers import camera_numbers
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME, Metadata, combine
+from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
-from flowlab.recordings.unused_files import robot_numbers, some_of
-from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import cut, natural_key, shown
+from flowlab.text import cut
 
 NAMES = {
     "color": ("color", "rgb", "img", "image", "images", "colors"),
@@ -45,8 +42,6 @@ NAMES = {
     "ends": ("episode_ends",),
 }
 """What arrays may be called, by what they are."""
-_MOST_TOLD = 4 << 20
-"""Larger arrays are not a camera's [bytes]."""
 POSES = ("T_world_cam", "cam2world", "camera_to_world")
 """Those of poses whose names say that they map the camera to the world."""
 
@@ -113,7 +108,6 @@ class ArraysReader:
             state=_samples(store, "state", *stamps),
             action=_samples(store, "action", *stamps),
             known=known,
-            checks=_unused_members(path, names, combine([("", given), *known])[0], poses is not None),
             used=tuple(f"{name}.npy" for what, name in names.items() if what != "cloud"),
             poses=poses,
         )
@@ -152,40 +146,6 @@ def _members(path: Path) -> set[str]:
             return {n.removesuffix(".npy") for n in file.namelist()}
     except (OSError, zipfile.BadZipFile):
         return set()
-
-
-def _unused_members(path: Path, names: dict[str, str], known: Metadata, posed: bool) -> tuple[Check, ...]:
-    """The arrays of an ``.npz`` file that no stream uses, by name; those of a folder are files."""
-    if path.is_dir():
-        return ()
-    used = {name for what, name in names.items() if what != "cloud"}
-    unused = sorted(_members(path) - used, key=natural_key)
-    if not unused:
-        return (Check("left out", Verdict.OK, "every array is used"),)
-    wanted = ", ".join(what for what in ("state", "action") if what not in names)
-    hint = f"; one that is the {wanted.replace(', ', ' or the ')} must be called so" if wanted else ""
-    says = f"{some_of(unused)} (no stream uses them{hint})"
-    checks = [Check("left out", Verdict.DOUBTFUL if _of_robots(unused, names) else Verdict.OK, says)]
-    for name in unused:
-        values = _small_member(path, name)
-        told = None if values is None else camera_numbers(name, values, known, posed)
-        checks += [] if told is None else [Check("camera", Verdict.DOUBTFUL, f"{shown(name)} is not used; {told}")]
-    return tuple(checks)
-
-
-def _small_member(path: Path, name: str) -> np.ndarray | None:
-    """An array that nothing uses; None where it is large, or cannot be read, which then does not matter."""
-    try:
-        with zipfile.ZipFile(path) as file:
-            size = file.getinfo(f"{name}.npy").file_size
-        return map_member(path, name) if size <= _MOST_TOLD else None
-    except (DataError, KeyError, OSError, zipfile.BadZipFile):
-        return None
-
-
-def _of_robots(unused: list[str], names: dict[str, str]) -> bool:
-    """Whether some of these look like the state or the action, of which there is none by its usual name."""
-    return any(robot_numbers(name, what) for name in unused for what in ("state", "action") if what not in names)
 
 
 def _called(name: str, count: int) -> tuple[str, ...]:
