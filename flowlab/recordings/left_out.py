@@ -11,7 +11,7 @@ from flowlab.recordings.file_contents import Contents, array_contents, file_cont
 from flowlab.recordings.folder_files import files_below, no_files_below
 from flowlab.recordings.harmless_files import why_harmless
 from flowlab.recordings.metadata import FILE_NAME
-from flowlab.recordings.unused_files import by_folder, is_ignored, matches, some_of
+from flowlab.recordings.unused_files import by_folder, is_ignored, matches, quoted, some_of
 from flowlab.recordings.unused_meaning import Unused, ask
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut, natural_key, shown
@@ -151,7 +151,7 @@ def _together(paths: list[Path]) -> Contents:
 def _of_odd(name: str, why: str) -> Check:
     """A doubt about what is neither a file nor a folder."""
     how = "put what it led to in its place" if "link" in why else "take it away"
-    says = f"{cut(name)} is not used: it is {why}; {how}, or say with 'ignore: [{cut(name)}]' that it is not to be used"
+    says = f"{cut(name)} is not used: it is {why}; {how}; if it is not to be used, write 'ignore: [{quoted(name)}]'"
     return Check("left out", Verdict.DOUBTFUL, says)
 
 

@@ -1,5 +1,6 @@
 """Names of files and arrays that nothing uses: what they may be, and how many are told in a few words."""
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
@@ -47,7 +48,12 @@ def by_folder(names: Iterable[str]) -> list[str]:
 
 def matches(name: str, pattern: str) -> bool:
     """Whether a pattern such as ``*.log`` means a file, or a folder that it is in."""
-    return fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern.rstrip('/')}/*")
+    return name == pattern or fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern.rstrip('/')}/*")
+
+
+def quoted(pattern: str) -> str:
+    """A pattern as YAML has it in a list."""
+    return cut(pattern if re.fullmatch(r"[\w./][\w./*-]*", pattern) else repr(pattern))
 
 
 def is_ignored(name: str, patterns: Sequence[str]) -> bool:

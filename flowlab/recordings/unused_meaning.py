@@ -15,7 +15,7 @@ from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.poses import read_poses
 from flowlab.recordings.stated_elsewhere import contradictions, states_what_is_used
 from flowlab.recordings.tables import read_table
-from flowlab.recordings.unused_files import robot_numbers
+from flowlab.recordings.unused_files import quoted, robot_numbers
 from flowlab.recordings.unused_times import called_times, times_doubt
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
@@ -47,7 +47,7 @@ class Unused:
     @property
     def pattern(self) -> str:
         """What to ignore it by."""
-        return cut(f"{self.name}*" if self.name.endswith("/") else self.name)
+        return quoted(f"{self.name}*" if self.name.endswith("/") else self.name)
 
     @property
     def told(self) -> str:
@@ -60,7 +60,7 @@ def ask(source: "ParsedRecording", item: Unused) -> Check | None:
     about, says = next(_doubts(source, item), ("", ""))
     if not says:
         return None
-    return Check(about, Verdict.DOUBTFUL, f"{says}; else 'ignore: [{item.pattern}]' says that it is not to be used")
+    return Check(about, Verdict.DOUBTFUL, f"{says}; if it is not to be used, write 'ignore: [{item.pattern}]'")
 
 
 def _doubts(source: "ParsedRecording", item: Unused) -> Iterator[tuple[str, str]]:
@@ -98,6 +98,8 @@ def _of_rows(source: "ParsedRecording", item: Unused, stem: str) -> str:
     """What is said of a file with numbers for every picture, which may be the robot's."""
     steps, values = {len(source.streams.color), len(source.streams.depth)}, item.contents.values
     if values is None or values.ndim != 2 or len(values) not in steps or called_poses(stem.lower()):
+        return ""
+    if item.contents.names and all(_TIMES.search(name.lower()) for name in item.contents.names):
         return ""
     rises = values.shape[1] == 1 and len(values) > 1 and (np.diff(values[:, 0]) > 0).all()
     if source.streams.state or rises:  # as times do
@@ -158,7 +160,8 @@ def _of_folder(source: "ParsedRecording", item: Unused) -> str:
 def _unknown(source: "ParsedRecording", item: Unused) -> str:
     """What is said of what is not known for what it is."""
     contents = item.contents
-    says = f"{item.told} is not used; it holds {contents.holds}"
+    verb = "" if contents.holds.startswith("is ") else "holds "
+    says = f"{item.told} is not used; it {verb}{contents.holds}"
     against = contradictions(source, contents)
     told = " ".join((item.name, *contents.names, contents.words)).lower()
     advice = "; ".join([*against, *_advice(source, item, told)])

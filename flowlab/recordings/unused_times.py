@@ -19,6 +19,8 @@ _TIMES = re.compile(r"(?:^|[_\-. ])(?:times?|ts|t|stamps?|clock)(?:$|[_\-. ])|ti
 _OF = {"depth": "depth_times", "state": "state_times", "joint": "state_times", "robot": "state_times",
        "action": "action_times"}  # fmt: skip
 """Of which stream times are, by a part of their name, and the key that names them; else of color."""
+_READ = ("", ".npy", ".txt", ".csv", ".tsv", ".log", ".dat")
+"""Endings of files of times that are read, and of arrays."""
 _NEAR = 0.5
 """Times agree that differ by less than this share of the usual step."""
 
@@ -43,6 +45,8 @@ def times_doubt(source: "ParsedRecording", name: str, contents: Contents) -> str
 
 def _advice(source: "ParsedRecording", name: str, key: str) -> str:
     """What to do where a file has the times of a stream."""
+    if PurePosixPath(name).suffix.lower() not in _READ:
+        return f"if it has the times of {_called(key)}, write them, one a line, into a file named with '{key}'"
     if source.reader.name == "plain" or (key not in ("times", "depth_times") and source.path.is_dir()):
         return f"if it has the times of {_called(key)}, write '{key}: {cut(name)}' into {FILE_NAME}"
     if source.reader.name == "arrays":
