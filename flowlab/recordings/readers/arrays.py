@@ -1,6 +1,7 @@
 """One episode as arrays, as diffusion policies keep them: an ``.npz`` file, or a folder of ``.npy`` files."""
 
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.text import cut
 
+_OF_TIMES = ("timestamp", "timestamps", "time", "times", "time_s", "ts", "stamps")
 NAMES = {
     "color": ("color", "rgb", "img", "image", "images", "colors"),
     "depth": ("depth", "depths", "depth_img"),
@@ -42,6 +44,8 @@ NAMES = {
     "ends": ("episode_ends",),
 }
 """What arrays may be called, by what they are."""
+TIMED = ("color", "depth", "state", "action")
+NAMES |= {f"{what} time": tuple(f"{name}_{t}" for name in NAMES[what] for t in _OF_TIMES) for what in TIMED}
 POSES = ("T_world_cam", "cam2world", "camera_to_world")
 """Those of poses whose names say that they map the camera to the world."""
 
@@ -91,7 +95,7 @@ class ArraysReader:
         assert color is not None
         assert depth is not None
         _check(store, names, color, depth)
-        stamps = _times(store, len(color), given)
+        stamps, depth_stamps = _times(store, len(color), given)
         K = store.load("intrinsics")
         T = None if given.T_world_cam is not None else store.load("pose")
         known: tuple[tuple[str, Metadata], ...] = (
@@ -103,14 +107,21 @@ class ArraysReader:
         elif T is not None:
             known += ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
-            ImageStream(_called(names["color"], len(color)), stamps[0], partial(_color, store, color), stamps[1]),
-            ImageStream(_called(names["depth"], len(depth)), stamps[0], partial(_depth, store, depth), stamps[1]),
+            _pictures(names["color"], partial(_color, store, color), *stamps),
+            _pictures(names["depth"], partial(_depth, store, depth), *depth_stamps),
             state=_samples(store, "state", *stamps),
             action=_samples(store, "action", *stamps),
             known=known,
-            used=tuple(f"{name}.npy" for what, name in names.items() if what != "cloud"),
+            used=tuple(f"{name}.npy" for what, name in names.items() if _is_read(what, names)),
             poses=poses,
         )
+
+
+def _is_read(what: str, names: dict[str, str]) -> bool:
+    """Whether an array is used by what it is: times where there is what they are of, one time for all where it is."""
+    if what == "time":
+        return "color time" not in names or "depth time" not in names
+    return what != "cloud" and (not what.endswith(" time") or what.removesuffix(" time") in names)
 
 
 def _find(path: Path) -> dict[str, str]:
@@ -127,7 +138,7 @@ def _present(path: Path) -> set[str]:
 def _check_single(path: Path, used: dict[str, str]) -> None:
     """Refuse several arrays that are called as one thing, unless they are the same."""
     present = _present(path)
-    for what in ("color", "depth", "state", "action", "time", "intrinsics", "pose"):
+    for what in NAMES.keys() - {"cloud", "ends"}:
         several = [name for name in NAMES[what] if name in present]
         if len(several) < 2:
             continue
@@ -148,9 +159,9 @@ def _members(path: Path) -> set[str]:
         return set()
 
 
-def _called(name: str, count: int) -> tuple[str, ...]:
-    """Names of the pictures of an array."""
-    return tuple(f"{name}[{k}]" for k in range(count))
+def _pictures(name: str, read: Callable[[int], np.ndarray], time_s: np.ndarray, timing: Timing) -> ImageStream:
+    """The pictures of an array."""
+    return ImageStream(tuple(f"{name}[{k}]" for k in range(len(time_s))), time_s, read, timing)
 
 
 def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.ndarray) -> None:
@@ -183,35 +194,55 @@ def _depth(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
     return check_depth(np.array(pictures[index]))
 
 
-def _times(store: _Store, steps: int, given: Metadata) -> tuple[np.ndarray, Timing]:
-    """When every step was, and what is known of that."""
-    time_s = store.load("time")
-    if time_s is not None:
-        if time_s.shape != (steps,) or time_s.dtype.kind not in "iuf":
-            found = f"{time_s.dtype} {cut(str(time_s.shape))}"
-            raise DataError(f"{store.path}: '{store.names['time']}' is {found}, expected numbers ({steps},)")
-        stamps, timing = check_times(store.path, np.asarray(time_s), time_s.dtype.kind in "iu")
-        return stamps, replace(timing, source=f"'{store.names['time']}'")
+_Stamps = tuple[np.ndarray, Timing]
+
+
+def _times(store: _Store, steps: int, given: Metadata) -> tuple[_Stamps, _Stamps]:
+    """When every step was, and what is known of that; of color and of depth, which may have times of their own."""
+    every = _stamps(store, "time", steps)
+    color, depth = (_stamps(store, f"{what} time", steps) for what in ("color", "depth"))
+    first = color or every
+    if first is not None:
+        return first, depth or every or first
     if given.fps is None:
         where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name
         raise DataError(f"{store.path}: has no times; write 'fps: 10' (steps per second) into {where}")
-    return np.arange(steps) / given.fps, Timing("steps over fps")
+    counted = np.arange(steps) / given.fps, Timing("steps over fps")
+    if depth is not None:
+        raise DataError(f"{store.path}: '{store.names['depth time']}' has the times of depth, and there are none of "
+                        "color; call those 'color_timestamps' or 'timestamp'")  # fmt: skip
+    return counted, counted
+
+
+def _stamps(store: _Store, what: str, steps: int | None) -> _Stamps | None:
+    """An array of times, and what is known of them; None where there is none."""
+    time_s = store.load(what)
+    if time_s is None:
+        return None
+    count = len(time_s) if steps is None and time_s.ndim else steps
+    if time_s.shape != (count,) or time_s.dtype.kind not in "iuf":
+        found = f"{time_s.dtype} {cut(str(time_s.shape))}"
+        raise DataError(f"{store.path}: '{store.names[what]}' is {found}, expected numbers ({count},)")
+    stamps, timing = check_times(store.path, np.asarray(time_s), time_s.dtype.kind in "iu")
+    return stamps, replace(timing, source=f"'{store.names[what]}'")
 
 
 def _samples(store: _Store, what: str, time_s: np.ndarray, timing: Timing) -> tuple[SampleStream, ...]:
-    """The rows of state or actions; nothing where there is no such array."""
+    """The rows of state or actions, at their own times where they have some; nothing where there is no such array."""
     values = store.load(what)
     if values is None:
         return ()
-    if values.ndim != 2 or len(values) != len(time_s) or values.dtype.kind not in "fiu":
+    own = _stamps(store, f"{what} time", None)
+    stamps, known = own or (time_s, timing)
+    if values.ndim != 2 or len(values) != len(stamps) or values.dtype.kind not in "fiu":
         raise DataError(
             f"{store.path}: '{store.names[what]}' is {values.dtype} {values.shape}, "
-            f"expected numbers ({len(time_s)}, width)"
+            f"expected numbers ({len(stamps)}, width)"
         )
     rows = to_float32(values)
     if not np.isfinite(rows).all():
         raise DataError(f"{store.path}: '{store.names[what]}' holds values that are not finite")
-    return (SampleStream(what, time_s, rows, timing),)
+    return (SampleStream(what, stamps, rows, known),)
 
 
 def _known(path: Path, K: np.ndarray) -> Metadata:
