@@ -1,7 +1,8 @@
 """Tables of numbers in text files, as robots, loggers and spreadsheets write them; columns are told by their names."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ class SampleTable:
     """Columns that hold text, as a frame's name."""
     integers: bool = False
     """Whether all numbers are written without a fraction."""
+    words: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    """The cells of the columns that hold text."""
 
     def column(self, name: str) -> int:
         """The place of a column. Raises :class:`DataError` with the names there are."""
@@ -83,7 +86,9 @@ def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -
             raise DataError(f"{path}: line {n} {_not_numbers(names, width, row)}")
         rows.append([np.nan if k in text else float(x) for k, x in enumerate(row)])
     integers = all(x.lstrip("+-").isdecimal() for _, row in cells for x in row)
-    return SampleTable(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text), integers)
+    words = {k: tuple(row[k].strip() for _, row in cells) for k in text}
+    called = tuple(n.strip() for n in names)
+    return SampleTable(path, called, np.array(rows, np.float64), frozenset(text), integers, words)
 
 
 def _not_numbers(names: list[str], width: int, row: list[str]) -> str:

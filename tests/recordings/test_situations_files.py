@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from real_recordings import STEPS, K, colors, write_folder, write_png
+from real_recordings import INTRINSICS, STEPS, K, colors, counts, opened, write_folder, write_png, write_yaml
 from synthetic import call_cli
 from test_rh20t_reader import write_calibration, write_camera
 
@@ -193,3 +193,78 @@ def test_files_of_rh20t_and_of_tum_are_known(tmp_path: Path, capsys: Capture) ->
 def _there(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
+
+
+# --- columns that say which picture a row belongs to, and clocks ---------------------------------------------
+
+COUNT = 16
+WALK = np.cumsum(np.random.default_rng(3).normal(0, 0.02, COUNT))
+SWAY = 0.3 * np.sin(0.7 * np.arange(COUNT))
+SHUFFLED = np.random.default_rng(1).permutation(COUNT)
+JITTER = 0.1 * np.arange(COUNT) + np.random.default_rng(0).normal(0, 0.008, COUNT)
+UNEVEN = np.cumsum(np.random.default_rng(3).uniform(0.06, 0.14, COUNT))
+UNEVEN *= 0.1 * (COUNT - 1) / (UNEVEN[-1] - UNEVEN[0])
+
+
+def columns(names: str, *values: Any) -> str:
+    rows = zip(*values, strict=True)
+    return f"{names}\n" * bool(names) + "".join(",".join(map(str, row)) + "\n" for row in rows)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [columns("filename,v", [f"{t:04d}.png" for t in SHUFFLED], SHUFFLED * 1.5),
+     columns("v,image,time", SHUFFLED * 1.5, [f"color/{t:04d}.png" for t in SHUFFLED], 5 * SHUFFLED),
+     columns("frame,v", SHUFFLED, SHUFFLED * 1.5),
+     columns("image_number,v", range(COUNT)[::-1], 1.5 * np.arange(COUNT)[::-1])],
+)  # fmt: skip
+def test_rows_that_name_their_pictures_belong_to_these(tmp_path: Path, text: str) -> None:
+    folder = write_folder(tmp_path / "r", steps=COUNT, state="s.csv")
+    put(folder, "s.csv", text)
+    np.testing.assert_allclose(opened(folder).state[:, 0], 1.5 * np.arange(COUNT))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (columns("idx,v", range(1, COUNT + 1), WALK), "column 'idx' counts the rows; .*row's picture, 'frame'"),
+        (columns("k,v", SHUFFLED, WALK), "column 'k' counts by one"),
+        (columns("v,counter", WALK, 5 * np.arange(COUNT)), "column 'counter' counts the rows"),
+        (columns("", WALK, range(COUNT)), "column 2 counts by one"),
+        (columns("img,v", [f"{t + 1:04d}.png" for t in range(COUNT)], WALK), "not all are color pictures"),
+        (columns("frame,v", [*range(COUNT - 1), 3], WALK), "names one picture in the rows 4 and 16"),
+        (columns("image_id,v", range(1, COUNT + 1), WALK), "state 1 to 16: .*'state_offset_s: 0'"),
+        (columns("", WALK, SWAY, JITTER), "column 3 goes on by 1 a second"),
+        (columns("", WALK, 1e6 * UNEVEN), "column 2 goes on by 1000000 a second"),
+        (np.c_[WALK, 77 + JITTER], "column 2 goes on by 1 a second"),
+        (columns("v,ms", WALK, 100 * np.arange(COUNT) % 1000), "column 'ms' is called as times are"),
+        (columns("m,v", (1.7e9 + JITTER) / 60, WALK), "column 'm' goes on by 1/60 a second"),
+        (columns("jd,v", [f"{2460263.5 + t / 86400:.9f}" for t in JITTER], WALK), "column 'jd' goes on by 1/86400"),
+        (columns("x,y,z", WALK, SWAY, 0.1 * np.arange(COUNT)), ""),
+        (columns("x,y,progress", WALK, SWAY, np.arange(COUNT) / COUNT), ""),
+        (np.c_[WALK, SWAY, 0.09 * np.arange(COUNT), 0.0167 / 10 * np.arange(COUNT)], ""),
+        (np.c_[WALK, 1.0 - np.cos(np.linspace(0, np.pi, COUNT))], ""),
+    ],
+)
+def test_columns_that_count_or_go_as_clocks_are_asked_about(
+    tmp_path: Path, capsys: Capture, text: str | np.ndarray, words: str
+) -> None:
+    file = "s.csv" if isinstance(text, str) else "s.npy"
+    folder = write_folder(tmp_path / "r", steps=COUNT, state=file)
+    put(folder, file, text)
+    code, out, _ = call_cli(capsys, "track-real", folder, "--dry-run", "--json")
+    (facts,) = json.loads(out)["recordings"]
+    assert code == (3 if words else 0), facts["problem"]
+    assert re.search(words, facts["problem"] or ""), facts["problem"]
+    assert words or [c for c in facts["checks"] if c["verdict"] in ("doubtful", "refused")] == []
+
+
+@pytest.mark.parametrize("column", [JITTER, np.arange(COUNT)[::-1]])
+def test_arrays_with_a_clock_or_a_count_among_the_state_are_refused(
+    tmp_path: Path, capsys: Capture, column: np.ndarray
+) -> None:
+    arrays = {"img": colors(COUNT), "depth": counts(COUNT), "agent_pos": np.c_[WALK, column]}
+    np.savez(tmp_path / "r.npz", **arrays)
+    write_yaml(tmp_path / "r.yaml", fps=10, depth_unit_m=0.001, intrinsics=INTRINSICS)
+    code, checks, _ = looked_at(capsys, tmp_path / "r.npz")
+    assert (code, [c["verdict"] for c in checks if c["about"] == "state numbers"]) == (3, ["refused"])
