@@ -15,7 +15,7 @@ _OFF_RATE = 0.03
 """A column whose mean rate is this share off a clock's is none."""
 _JITTER = 0.5
 """Steps of a clock differ by less than this share of the usual one, or its readings from an even course do."""
-_RATES = {1: 1.0, 10**3: 1e3, 10**6: 1e6, 10**9: 1e9}
+_RATES = {"1": 1.0, "1000": 1e3, "1000000": 1e6, "1000000000": 1e9}
 """What clocks go on by in a second, and how it is told."""
 _SLOW = {"1/60": 1 / 60, "1/3600": 1 / 3600, "1/86400": 1 / 86400}
 _LARGE = 1e4
@@ -91,7 +91,7 @@ def _rises(column: np.ndarray) -> bool:
     return bool(len(steps) and (steps >= 0).all() and np.mean(steps > 0) > 0.5)
 
 
-def _rate(column: np.ndarray, time_s: np.ndarray) -> int | str | None:
+def _rate(column: np.ndarray, time_s: np.ndarray) -> str | None:
     """How much a column goes on in a second, where it does so evenly and in the mean as much as a clock would."""
     steps, times = np.diff(column), np.diff(time_s)
     if len(column) < _FEWEST or not (steps > 0).all() or not (times > 0).all():

@@ -15,6 +15,7 @@ from test_situations_meaning import Capture, looked_at
 from flowlab.recordings.depth_unit_check import likely_unit
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_camera_info import rectified
+from flowlab.recordings.readers.ros_topics import of_two_cameras
 from flowlab.recordings.readers.tum import TUMReader
 
 BENT = [0.3, -0.1, 0.0, 0.0, 0.0]
@@ -299,3 +300,46 @@ def test_topics_that_are_not_read_are_listed(tmp_path: Path, capsys: Capture) ->
 )
 def test_names_say_whether_pictures_were_rectified(topic: str, straight: bool, verdict: str) -> None:
     assert rectified(topic)[:2] == (straight, verdict)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "two"),
+    [
+        ("/cam1/rgb/image_raw", "/cam2/depth_registered/image", True),
+        ("/robot1/camera/color/image_raw", "/robot2/camera/aligned_depth_to_color/image_raw", True),
+        ("/left_color/image", "/right_depth/image_raw", True),
+        ("/wrist/d405/color/image", "/head/d405/aligned_depth_to_color/image", True),
+        ("/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw", False),
+        ("/camera/rgb/image_rect_color", "/camera/depth_registered/sw_registered/image_rect_raw", False),
+        ("/rgb/image_raw", "/depth_to_rgb/image_raw", False),
+        ("/zed/zed_node/left/image_rect_color", "/zed/zed_node/depth/depth_registered", False),
+        ("/device_0/sensor_1/Color_0/image/data", "/device_0/sensor_2/Depth_0/image/data", False),
+        ("/oak/rgb/image_raw", "/oak/stereo/image_raw", False),
+        ("/rgb_camera/image", "/depth_camera/image", False),
+    ],
+)
+def test_names_of_topics_tell_two_cameras(color: str, depth: str, two: bool) -> None:
+    assert of_two_cameras(color, depth) == two
+
+
+@pytest.mark.parametrize(
+    ("depth", "stated", "verdict"),
+    [("cam1", False, "ok"), ("cam2", False, "doubtful"), ("cam2", True, "assumed")],
+)
+def test_depth_of_another_cameras_namespace_is_doubtful(
+    tmp_path: Path, capsys: Capture, depth: str, stated: bool, verdict: str
+) -> None:
+    """Both say the same frame, and the name of depth that it is registered."""
+
+    def say_all(m: Messages, say: Say) -> None:
+        def renamed(topic: str, *rest: Any) -> None:
+            say(topic.replace("/camera/", f"/{depth}/" if "aligned" in topic else "/cam1/"), *rest)
+
+        say_camera(m, renamed)
+
+    topics = {"color": "/cam1/color/image_raw", "depth": f"/{depth}/aligned_depth_to_color/image_raw"}
+    bag = write_bag(tmp_path / "r.bag", 1, say_all)
+    write_yaml(tmp_path / "r.yaml", topics=topics if stated else None)
+    code, _, checks = looked_at(capsys, bag)
+    assert (code, checks["camera_info"][0]) == (0, verdict), checks["camera_info"]
+    assert ("of two cameras" in checks["camera_info"][1]) == (verdict != "ok")
