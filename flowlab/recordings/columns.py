@@ -175,11 +175,16 @@ def _doubts(
     doubtful = dict.fromkeys(times[1:], "is a time, too")
     doubtful |= {k: "is a part of a time" for k in rest if table.names and plain_name(table.names[k]) in _PARTS}
     doubtful |= {k: _of_text(table.words.get(k, ())) for k in rest if k in table.text}
-    doubtful |= {k: "counts the rows" for k in rest if table.names and plain_name(table.names[k]) in _COUNTS
+    doubtful |= {k: "counts the rows" for k in rest if table.names and _is_count(table.names[k])
                  and _rises(table.values[:, k])}  # fmt: skip
     if not times and not timed and not table.names and _is_clock(table, color_s):
         doubtful[0] = "rises like a clock"
     return {k: why for k, why in doubtful.items() if k in rest}
+
+
+def _is_count(name: str) -> bool:
+    """Whether a column is called as numbers of rows are; a name in other letters than a to z is not known."""
+    return plain_name(name) in _COUNTS and (plain_name(name) != "" or not any(map(str.isalpha, name)))
 
 
 def _of_text(cells: Sequence[str]) -> str:

@@ -11,6 +11,9 @@ from real_recordings import INTRINSICS, STEPS, K, colors, counts, opened, write_
 from synthetic import call_cli
 from test_rh20t_reader import write_calibration, write_camera
 
+from flowlab.errors import DataError
+from flowlab.recordings.poses import read_poses
+
 Capture = pytest.CaptureFixture[str]
 CLOCK = np.arange(STEPS) / 10
 POSES = np.tile(np.eye(4), (STEPS, 1, 1))
@@ -268,3 +271,44 @@ def test_arrays_with_a_clock_or_a_count_among_the_state_are_refused(
     write_yaml(tmp_path / "r.yaml", fps=10, depth_unit_m=0.001, intrinsics=INTRINSICS)
     code, checks, _ = looked_at(capsys, tmp_path / "r.npz")
     assert (code, [c["verdict"] for c in checks if c["about"] == "state numbers"]) == (3, ["refused"])
+
+
+# --- tables of poses and files that are no tables -------------------------------------------------------------
+
+EUROC = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+
+
+def test_columns_of_poses_are_told_by_their_names(tmp_path: Path) -> None:
+    put(tmp_path, "p.csv", EUROC + lines(np.c_[1e9 * TUM[:, :1], TUM[:, 1:4], TUM[:, 7:], TUM[:, 4:7]]))
+    own, T = read_poses(tmp_path / "p.csv")
+    assert own is not None
+    np.testing.assert_allclose(own[0], CLOCK)
+    np.testing.assert_allclose(T, POSES, atol=1e-4)
+    for names, odd in ("t,a,b,c,d,e,f,g", "t, a, b"), ("t,tx [mm],ty [mm],tz [mm],qx,qy,qz,qw", r"tx \[mm\]"):
+        put(tmp_path, "p.csv", f"{names}\n" + lines(TUM))
+        with pytest.raises(DataError, match=rf"{odd}.* not known, expected poses"):
+            read_poses(tmp_path / "p.csv")
+
+
+@pytest.mark.parametrize("key", ["state", "times", "T_world_cam_file"])
+def test_what_is_no_table_is_refused_as_that(tmp_path: Path, capsys: Capture, key: str) -> None:
+    folder = write_folder(tmp_path / "r", **{key: "x.json"}, fps=None if key == "times" else 10)
+    put(folder, "x.json", POSES.tolist())
+    code, out, _ = call_cli(capsys, "track-real", folder, "--dry-run", "--json")
+    (facts,) = json.loads(out)["recordings"]
+    assert (code, "x.json: is no table; write its numbers as .npy" in facts["problem"]) == (3, True)
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "words"),
+    [
+        ({"fx": 3.4, "fy": 3.4, "cx": 1.8, "cy": 1.35}, "fx: ..., fy: ..., cx: ..., cy: ..."),
+        ({"fx": 0.94, "fy": 1.25, "cx": 0.495, "cy": 11.7}, "cx: 15.34, cy: 11.7}"),
+    ],
+)
+def test_no_principal_point_is_offered_that_would_be_refused(
+    tmp_path: Path, capsys: Capture, intrinsics: dict[str, float], words: str
+) -> None:
+    code, _, problem = looked_at(capsys, write_folder(tmp_path / "r", intrinsics=intrinsics))
+    assert code == 3
+    assert words in problem
