@@ -1,6 +1,7 @@
 """What a file, or an array, that nothing uses holds: its numbers where it has some, its names, a few words."""
 
 import re
+import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,8 +46,10 @@ class Contents:
 def array_contents(archive: Path, name: str) -> Contents:
     """What an array of an ``.npz`` file holds."""
     try:
-        return _of_array(map_member(archive, name), name)
-    except (FlowlabError, ValueError, OSError, KeyError):
+        with zipfile.ZipFile(archive) as file:
+            size = file.getinfo(f"{name}.npy").file_size
+        return _of_array(map_member(archive, name), name) if size <= _MOST_READ else Contents(f"{size:,} bytes")
+    except (FlowlabError, ValueError, OSError, KeyError, zipfile.BadZipFile):
         return Contents("an array that cannot be read")
 
 
@@ -64,7 +67,7 @@ def file_contents(path: Path) -> Contents:
         if suffix == ".npz":
             return _of_archive(path)
         return _of_text(path, suffix) if path.stat().st_size <= _MOST_READ else _large_text(path)
-    except (FlowlabError, ValueError, TypeError, OSError, RecursionError):
+    except (FlowlabError, ValueError, TypeError, OSError, RecursionError, zipfile.BadZipFile):
         return Contents("what cannot be read here")
 
 
@@ -77,8 +80,6 @@ def _of_array(values: np.ndarray, name: str) -> Contents:
 
 
 def _of_archive(path: Path) -> Contents:
-    import zipfile
-
     with zipfile.ZipFile(path) as archive:
         names = tuple(n.removesuffix(".npy") for n in archive.namelist())
     return Contents(f"the arrays {_some(names)}", names=names)

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
 
 _MANY = 3
-"""More files of one kind in a folder are one question."""
+"""So many files of one kind in a folder are one question."""
+_MANY_BESIDE = 8
+"""So many beside the folders are one, too."""
 _LOOKED_AT = 8
 """So many of them are read."""
 _STATED = "not used, as 'ignore' says"
@@ -128,9 +130,9 @@ def _items(source: "ParsedRecording", files: dict[str, Path | None]) -> Iterator
         folder, _, last = name.rpartition("/")
         groups.setdefault((folder, PurePosixPath(last).suffix.lower()), []).append(name)
     for (folder, _), names in groups.items():
-        if folder and len(names) > _MANY - 1:
-            paths = [path for name in names if (path := files[name]) is not None]
-            yield Unused(f"{folder}/", paths[0], len(names), _together(paths))
+        paths = [path for name in names if (path := files[name]) is not None]
+        if paths and len(names) >= (_MANY if folder else _MANY_BESIDE):
+            yield Unused(f"{folder or '.'}/", paths[0], len(names), _together(paths))
             continue
         for name in names:
             path = files[name]

@@ -47,7 +47,9 @@ def by_folder(names: Iterable[str]) -> list[str]:
 
 
 def matches(name: str, pattern: str) -> bool:
-    """Whether a pattern such as ``*.log`` means a file, or a folder that it is in."""
+    """Whether a pattern such as ``*.log`` means a file, or a folder that it is in; one with ``./`` none in folders."""
+    if pattern.startswith("./"):
+        return "/" not in name and fnmatchcase(name, pattern[2:])
     return name == pattern or fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern.rstrip('/')}/*")
 
 

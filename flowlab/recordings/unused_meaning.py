@@ -47,7 +47,8 @@ class Unused:
     @property
     def pattern(self) -> str:
         """What to ignore it by."""
-        return quoted(f"{self.name}*" if self.name.endswith("/") else self.name)
+        suffix = "" if self.path is None or self.name != "./" else self.path.suffix
+        return quoted(f"{self.name}*{suffix}" if self.name.endswith("/") else self.name)
 
     @property
     def told(self) -> str:

@@ -131,6 +131,17 @@ def test_what_is_known_to_be_harmless_is_listed(tmp_path: Path, capsys: Capture)
     assert all(word in says for word in ("documentation", "checksums", "to look at", "says what is used"))
 
 
+def test_many_files_of_one_kind_are_one_question(tmp_path: Path, capsys: Capture) -> None:
+    folder = write_folder(tmp_path / "r")
+    for t in range(9):
+        put(folder, f"left_{t}.png", b"x")
+    _, checks, _ = looked_at(capsys, folder)
+    assert "write 'ignore: [./*.png]'" in "".join(doubts(checks, "./ (9 files)"))
+    write_folder(folder, ignore=["./*.png"])
+    _, checks, _ = looked_at(capsys, folder)
+    assert [c["verdict"] for c in checks if c["about"] in ("left out", "ignore")] == ["ok"]
+
+
 def test_what_the_user_ignores_is_ok_and_nothing_else_is(tmp_path: Path, capsys: Capture) -> None:
     folder = write_folder(tmp_path / "r", ignore=["*.bin", "left/"])
     for name in ("x.bin", "y/z.bin", "left/0.png", "left/more/1.png"):
