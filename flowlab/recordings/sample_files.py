@@ -65,7 +65,10 @@ def load_samples(
     rows = to_float32(found.values)
     if not np.isfinite(rows).all():
         row = int(np.argmax(~np.isfinite(rows).all(1)))
-        raise DataError(f"{path}: row {row + 1} holds a value that is not finite, or too large for float32")
+        raise DataError(
+            f"{path}: row {row + 1} holds a value that is not finite, or too large for float32; take such rows out, "
+            f"and give the others times, as with '{name}_times'"
+        )
     return SampleStream(name, where, rows, timing, columns=found.names)
 
 

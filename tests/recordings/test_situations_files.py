@@ -323,3 +323,13 @@ def test_no_principal_point_is_offered_that_would_be_refused(
     code, _, problem = looked_at(capsys, write_folder(tmp_path / "r", intrinsics=intrinsics))
     assert code == 3
     assert words in problem
+
+
+def test_poses_that_map_the_world_to_the_camera_are_called_so(tmp_path: Path, capsys: Capture) -> None:
+    arrays = {"img": colors(), "depth": counts(), "world_to_camera": POSES}
+    np.savez(tmp_path / "r.npz", **arrays)
+    write_yaml(tmp_path / "r.yaml", fps=10, depth_unit_m=0.001, intrinsics=INTRINSICS)
+    _, out, _ = call_cli(capsys, "track-real", tmp_path / "r.npz", "--dry-run", "--json")
+    assert (
+        "'world_to_camera' maps the world to the camera, by its name; " in json.loads(out)["recordings"][0]["problem"]
+    )

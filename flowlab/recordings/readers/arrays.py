@@ -48,6 +48,7 @@ TIMED = ("color", "depth", "state", "action")
 NAMES |= {f"{what} time": tuple(f"{name}_{t}" for name in NAMES[what] for t in _OF_TIMES) for what in TIMED}
 POSES = ("T_world_cam", "cam2world", "camera_to_world")
 """Those of poses whose names say that they map the camera to the world."""
+_INVERSE = ("T_cam_world", "world2cam", "world_to_camera")
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,12 +267,20 @@ def _poses(store: _Store, T: np.ndarray, time_s: np.ndarray, timing: Timing) -> 
     """The poses of a camera that moves."""
     name = store.names["pose"]
     if name not in POSES:
-        raise DataError(f"{store.path}: '{name}' does not say whether it maps camera to world or world to camera; call it "  # noqa: E501
-                        "'T_world_cam' if it maps camera to world, else invert it")  # fmt: skip
+        raise DataError(
+            f"{store.path}: '{name}' {_direction(name)}; camera to world is called 'T_world_cam', else invert it"
+        )
     found = check_poses(f"{store.path}: '{name}'", T)
     if len(found) != len(time_s):
         raise DataError(f"{store.path}: '{name}' has {len(found)} poses for {len(time_s)} steps, expected one for each")
     return pose_stream(f"'{name}'", time_s, found, timing)
+
+
+def _direction(name: str) -> str:
+    """What is said of poses that are not called as those of the camera in the world."""
+    if name in _INVERSE:
+        return "maps the world to the camera, by its name"
+    return "does not say whether it maps camera to world or world to camera"
 
 
 def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
@@ -281,5 +290,5 @@ def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
         raise DataError(f"{path}: '{name}' is {T.dtype} {cut(str(T.shape))}, expected numbers (4, 4); {advice}")
     every = T.reshape(-1, 4, 4).astype(float)
     if name not in POSES:
-        raise DataError(f"{path}: '{name}' does not say whether it maps camera to world or world to camera; {advice}")
+        raise DataError(f"{path}: '{name}' {_direction(name)}; {advice}")
     return Metadata(T_world_cam=every[0].tolist())
