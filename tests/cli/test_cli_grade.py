@@ -108,7 +108,7 @@ def test_tasks_are_simulated_once(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("arguments", "error", "expected"),
     [
-        ((), UsageError, "nothing to grade; give folders .* or --tasks hammer,door-open"),
+        ((), UsageError, "nothing to grade; give folders .* or --tasks hammer,push"),
         ((*SMALL, "--tasks", "reach, hamer"), UsageError, "did you mean hammer"),
         (
             ("--tasks", "hammer", "--tracker", "rigid-body"),
