@@ -94,8 +94,8 @@ def test_a_film_is_made_once_and_leaves_alone_what_is_not_its_own(tmp_path: Path
 def test_names_that_do_not_exist(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no family of scenes is called 'tabeltop'; did you mean tabletop"):
         make_film(tmp_path / "x", "tabeltop", 0)
-    with pytest.raises(UsageError, match="no sensor is called 'kinnect'; did you mean kinect"):
-        make_film(tmp_path / "x", "tabletop", 0, FilmSettings(sensor="kinnect"))
+    with pytest.raises(UsageError, match="no sensor is called 'kineckt'; did you mean kinect"):
+        make_film(tmp_path / "x", "tabletop", 0, FilmSettings(sensor="kineckt"))
 
 
 def test_two_families_are_held_out_and_the_help_names_all() -> None:
