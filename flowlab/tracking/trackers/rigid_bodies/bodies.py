@@ -42,10 +42,12 @@ def new_body(pictures: ClipFeatures, grid: MotionGrid, region: Bool[np.ndarray, 
     return RigidBody(pixels, RigidMotion.identity(frames), np.zeros(frames, bool), region)
 
 
-def changed_body(fit: RigidBodyFit, region: Bool[np.ndarray, "h w"], guess: RigidMotion) -> RigidBody:
+def changed_body(
+    pictures: ClipFeatures, grid: MotionGrid, region: Bool[np.ndarray, "h w"], guess: RigidMotion
+) -> RigidBody:
     """A body of a region of cells that may move like another."""
-    pixels = region_pixels(fit.pictures, fit.grid, region)
-    return RigidBody(pixels, guess, np.ones(len(fit.pictures), bool), region)
+    pixels = region_pixels(pictures, grid, region)
+    return RigidBody(pixels, guess, np.ones(len(pictures), bool), region)
 
 
 def region_pixels(

@@ -6,6 +6,7 @@ import numpy as np
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import assign
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, changed_body, new_body
+from flowlab.tracking.trackers.rigid_bodies.camera_motion import with_camera_motion
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
 from flowlab.tracking.trackers.rigid_bodies.merging import merge
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import MotionGrid, segment_motion
@@ -28,7 +29,7 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
         seed: Of the random choices; the same seed gives the same fit.
     """
     rng = np.random.default_rng(seed)
-    grid = segment_motion(pictures)
+    pictures, grid = with_camera_motion(pictures, segment_motion(pictures), rng)
     seeds = track_seeds(pictures, grid.pixels(grid.valid & ~grid.static & ~grid.edge), rng)
     proposed = [RigidBody(p.pixels, p.motion, p.known) for p in propose_motions(seeds, _MAX_PROPOSALS, rng)]
     bodies = track_poses(pictures, [*_small_moved_bodies(pictures, grid), *proposed], rng)
@@ -76,5 +77,5 @@ def _refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
         if same:
             kept.append(replace(body, region=region))
         else:
-            changed.append(changed_body(fit, region, body.motion))
+            changed.append(changed_body(fit.pictures, fit.grid, region, body.motion))
     return [*kept, *track_poses(fit.pictures, changed, rng)]

@@ -63,7 +63,7 @@ def neighbors(fit: RigidBodyFit) -> list[tuple[int, int]]:
 def _as_one(fit: RigidBodyFit, owner: Int64[np.ndarray, "h w"], a: int, b: int) -> RigidBody:
     """A body of the cells of two, which may move as the larger of them does."""
     larger = a if (owner == a).sum() >= (owner == b).sum() else b
-    return changed_body(fit, (owner == a) | (owner == b), fit.bodies[larger - 1].motion)
+    return changed_body(fit.pictures, fit.grid, (owner == a) | (owner == b), fit.bodies[larger - 1].motion)
 
 
 def _merit(fit: RigidBodyFit, owner: Int64[np.ndarray, "h w"], pair: tuple[int, int], motion: RigidMotion) -> float:

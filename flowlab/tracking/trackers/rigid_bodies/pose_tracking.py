@@ -41,9 +41,11 @@ class RigidBody:
 class _BodyBatch:
     """Some bodies, as arrays that compiled code takes; B bodies of n points."""
 
-    def __init__(self, pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator) -> None:
+    def __init__(
+        self, pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator, points: int
+    ) -> None:
         self.pictures = pictures
-        chosen = [b.pixels[_sample(len(b.pixels), rng)] for b in bodies]
+        chosen = [b.pixels[_sample(len(b.pixels), points, rng)] for b in bodies]
         uv = np.stack(chosen)
         z = pictures.smooth[0, uv[..., 1], uv[..., 0]].astype(float)
         self.points = pictures.unproject(uv.astype(float), z)
@@ -74,27 +76,30 @@ class _BodyBatch:
         return nearest_rotation(R), s
 
 
-def _sample(n: int, rng: np.random.Generator) -> np.ndarray:
+def _sample(n: int, points: int, rng: np.random.Generator) -> np.ndarray:
     """Indices of the pixels a body of n is tracked by."""
-    if n == _POINTS_PER_BODY:
+    if n == points:
         return np.arange(n)
-    return rng.choice(n, _POINTS_PER_BODY, replace=n < _POINTS_PER_BODY)
+    return rng.choice(n, points, replace=n < points)
 
 
-def track_poses(pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator) -> list[RigidBody]:
+def track_poses(
+    pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator, points: int = _POINTS_PER_BODY
+) -> list[RigidBody]:
     """Find the motions of some bodies, all of them together, frame by frame.
 
     Args:
         pictures: The clip.
         bodies: Which pixels of the first frame move as one, and guesses of how.
         rng: Chooses the pixels by which a body is tracked.
+        points: How many these are for each.
 
     Returns:
         The same bodies in the same order, with the motions found.
     """
     if not bodies:
         return []
-    batch, frames, count = _BodyBatch(pictures, bodies, rng), len(pictures), len(bodies)
+    batch, frames, count = _BodyBatch(pictures, bodies, rng, points), len(pictures), len(bodies)
     R, s = np.tile(np.eye(3), (frames, count, 1, 1)), np.zeros((frames, count, 3))
     energy = np.zeros(count)
     seen_R, seen_s = R[0].copy(), s[0].copy()
