@@ -10,7 +10,7 @@ def grid_of(depth: np.ndarray) -> MotionGrid:
     """A grid of cells of these depths, of which nothing else is known."""
     v, u = (STEP * x.astype(np.int32) for x in np.indices(depth.shape))
     nothing = np.zeros(depth.shape, bool)
-    return MotionGrid(v, u, depth.astype(np.float32), depth > 0, nothing, nothing, nothing, nothing)
+    return MotionGrid(v, u, depth.astype(np.float32), depth > 0, nothing, nothing, nothing, nothing, nothing)
 
 
 def test_plates_moved_and_the_wall_stayed() -> None:

@@ -53,7 +53,8 @@ def _small_moved_bodies(pictures: ClipFeatures, grid: MotionGrid) -> list[RigidB
         moved = (whole & grid.moved).sum()
         if moved >= 7 and 1.25 * moved < whole.sum() <= 1200:
             parts.append(whole)
-    return [new_body(pictures, grid, m) for m in parts[:9]]
+    changed = [m for m in grid.components(grid.changed & ~grid.moved) if 7 <= m.sum() <= 1200][:5]
+    return [new_body(pictures, grid, m) for m in [*parts[:9], *changed]]
 
 
 def _bodies_of_unexplained(pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody]) -> list[RigidBody]:

@@ -16,6 +16,10 @@ _LATE_SHARE = 0.85
 """What is static must be there in the frames after this share of the clip, too."""
 _MIN_STATIC_SHARE = 0.25
 """A camera that stands still sees at least this share of the scene stay."""
+_CHANGE_COST = np.array([[0.75 / 255, 0.5 / 70, 1 / 30, 1 / 30]], np.float32) * 16
+"""What one count of each feature channel's change costs, in sixteenths; shadows change lightness, which counts less."""
+_CHANGED, _CHANGED_SHARE = 0.35 * 16, 0.08
+"""A cell looks different in a frame if it costs more, and has changed if it does in this share of the frames."""
 _UNDECIDED_BAND = 6
 """Cells around what moves in which the motion is decided by cost, not by having stayed."""
 
@@ -38,6 +42,8 @@ class MotionGrid:
     """Looks the same and is as deep to the end."""
     undecided: Bool[np.ndarray, "h w"]
     """Not static, or near something that moved: its motion is to be found."""
+    changed: Bool[np.ndarray, "h w"]
+    """Is as deep later, and looks different: a thin thing left or came, or a shadow."""
 
     def pixels(self, mask: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "n 2"]:
         """(u, v) of the cells of a mask."""
@@ -67,7 +73,7 @@ def segment_motion(pictures: ClipFeatures) -> MotionGrid:
     height, width = pictures.depth.shape[1:]
     v, u = (x.astype(np.int32) for x in np.mgrid[0:height:STEP, 0:width:STEP])
     z = pictures.depth[0, ::STEP, ::STEP]
-    through, near, unlike, late = _count_evidence(pictures, z)
+    through, near, unlike, late, recolored = _count_evidence(pictures, z)
     valid, steps = z > 0, len(pictures) - 1
     moved = valid & (through >= max(2, 0.03 * len(pictures)))
     moved &= cv2.boxFilter(moved.astype(np.float32), -1, (3, 3), normalize=False) >= 3
@@ -75,16 +81,20 @@ def segment_motion(pictures: ClipFeatures) -> MotionGrid:
     static = valid & ~moved & (near >= 0.25 * steps) & (late >= 0.5 * (1 - _LATE_SHARE) * steps) & ~looks_different
     if static.sum() < _MIN_STATIC_SHARE * valid.sum():
         static[:] = False  # the camera moves: what looks the same does so by chance
+    changed = valid & (recolored >= max(3, _CHANGED_SHARE * steps))
+    changed &= cv2.boxFilter(changed.astype(np.float32), -1, (3, 3), normalize=False) >= 3
+    static &= ~changed
     undecided = (valid & ~static) | _grow(moved, z, valid)
-    return MotionGrid(v, u, z, valid, _edges(pictures.depth[0])[::STEP, ::STEP], moved, static, undecided)
+    return MotionGrid(v, u, z, valid, _edges(pictures.depth[0])[::STEP, ::STEP], moved, static, undecided, changed)
 
 
 def _count_evidence(pictures: ClipFeatures, z: np.ndarray) -> tuple[np.ndarray, ...]:
     """In how many later frames the camera looks through each cell of depth z (h, w) [m], in how many the surface is
-    there still, how much it looks unlike the first frame in those together, and in how many of the last it is."""
-    through, near, unlike, late = np.zeros((4, *z.shape))
+    there still, how much it looks unlike the first frame in those together, in how many of the last it is, and in how
+    many it has another color."""
+    through, near, unlike, late, recolored = np.zeros((5, *z.shape))
     for t in range(1, len(pictures)):
-        depth, lightness, z = _as_first_seen(pictures, t)
+        depth, feature, z = _as_first_seen(pictures, t)
         within = 0.010 * np.maximum(1, z * z)
         low, high = (x[::STEP, ::STEP] for x in depth[1:])
         d = depth[0][::STEP, ::STEP]
@@ -94,25 +104,26 @@ def _count_evidence(pictures: ClipFeatures, z: np.ndarray) -> tuple[np.ndarray, 
         through += seen_through
         near += there
         late += there & (t >= _LATE_SHARE * len(pictures))
-        change = cv2.blur(cv2.absdiff(lightness, pictures.feature[0, :, :, 0]), (5, 5))
-        unlike += there * change[::STEP, ::STEP]
-    return through, near, unlike, late
+        change = cv2.absdiff(feature, pictures.feature[0])
+        unlike += there * cv2.blur(change[..., 0], (5, 5))[::STEP, ::STEP]
+        cost = cv2.transform(cv2.blur(change, (3, 3)), _CHANGE_COST)[::STEP, ::STEP]
+        recolored += there & (cost > _CHANGED)
+    return through, near, unlike, late, recolored
 
 
 def _as_first_seen(pictures: ClipFeatures, t: int) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
     """Of a later frame, what it shows where each pixel of the first would be if it stood still: depth, with its least
-    and greatest around, and lightness; and the depth (h, w) [m] that each cell would then have."""
-    depth = (pictures.depth[t], *_extremes(pictures.depth[t]))
-    lightness = pictures.feature[t, :, :, 0]
+    and greatest around, and features; and the depth (h, w) [m] that each cell would then have."""
+    depth, feature = (pictures.depth[t], *_extremes(pictures.depth[t])), pictures.feature[t]
     if pictures.still is None:
-        return depth, lightness, pictures.depth[0, ::STEP, ::STEP]
-    v, u = np.mgrid[: lightness.shape[0], : lightness.shape[1]]
+        return depth, feature, pictures.depth[0, ::STEP, ::STEP]
+    v, u = np.mgrid[: feature.shape[0], : feature.shape[1]]
     z = np.where(pictures.depth[0] > 0, pictures.depth[0], 1.0)
     xyz = pictures.unproject(np.stack([u, v], -1), z) @ pictures.still.R[t].T + pictures.still.t[t]
     at = pictures.project(xyz).astype(np.float32)
     at[xyz[..., 2] <= 0] = -1e4
     seen = tuple(cv2.remap(x, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderValue=0) for x in depth)
-    return seen, cv2.remap(lightness, at[..., 0], at[..., 1], cv2.INTER_LINEAR), xyz[::STEP, ::STEP, 2]
+    return seen, cv2.remap(feature, at[..., 0], at[..., 1], cv2.INTER_LINEAR), xyz[::STEP, ::STEP, 2]
 
 
 def _edges(depth: np.ndarray) -> np.ndarray:

@@ -39,6 +39,8 @@ class Trajectories:
     pixels: Int32[np.ndarray, "n 2"]
     xyz_cam: Float64[np.ndarray, "T n 3"]
     known: Bool[np.ndarray, "T n"]
+    still: Float64[np.ndarray, "T n 3"]
+    """Where they would be if they stood still."""
 
 
 def flow(
@@ -69,13 +71,14 @@ def track_seeds(pictures: ClipFeatures, pixels: Int32[np.ndarray, "n 2"], rng: n
     xyz = np.zeros((len(pictures), len(pixels), 3))
     known = np.zeros((len(pictures), len(pixels)), bool)
     xyz[0], known[0] = pictures.unproject(uv0, z0), True
+    still = pictures.stillness.apply(xyz[0])
+    still_uv = pictures.project(still).astype(np.float32)
     uv, z, alive, resting = uv0.copy(), z0.copy(), known[0].copy(), known[0].copy()
     for t in range(1, len(pictures)):
-        change = cv2.blur(cv2.absdiff(pictures.feature[t, :, :, 0], pictures.feature[0, :, :, 0]), (5, 5))
-        d = pictures.depth[t, pixels[:, 1], pixels[:, 0]]
         # A point that has not moved yet is where it was: flow would only let it drift.
-        resting &= (np.abs(d - z0) < 0.010 * np.maximum(1, z0 * z0)) & (change[pixels[:, 1], pixels[:, 0]] < 30)
-        uv[resting] = uv0[resting]
+        at, deep = still_uv[t], still[t, :, 2]
+        resting &= _rests(pictures, t, pixels, at, deep)
+        uv[resting], z[resting] = at[resting], deep[resting]
         going = np.flatnonzero(alive & ~resting)
         if len(going):
             q, ok = flow(pictures, t, uv[going])
@@ -85,7 +88,22 @@ def track_seeds(pictures: ClipFeatures, pixels: Int32[np.ndarray, "n 2"], rng: n
         known[t] = alive & found
         z = np.where(known[t], reading, z)
         xyz[t] = pictures.unproject(uv, z)
-    return Trajectories(pixels, xyz, known)
+    return Trajectories(pixels, xyz, known, still)
+
+
+def _rests(pictures: ClipFeatures, t: int, pixels: np.ndarray, at: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Whether frame t shows at pixels (n, 2) and depths (n,) [m] what the first frame shows at other pixels (n, 2)."""
+    height, width = pictures.depth.shape[1:]
+    j, i = np.clip(np.rint(at), 0, [width - 1, height - 1]).astype(int).T
+    inside = (at >= 0).all(1) & (at[:, 0] <= width - 1) & (at[:, 1] <= height - 1)
+    near = np.abs(pictures.depth[t, i, j] - z) < 0.010 * np.maximum(1, z * z)
+    then, now = pictures.feature[0, :, :, 0], pictures.feature[t, :, :, 0]
+    change = np.zeros(len(z))
+    for y, x in np.argwhere(np.ones((5, 5))) - 2:
+        a, b = np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)
+        c, d = np.clip(pixels[:, 1] + y, 0, height - 1), np.clip(pixels[:, 0] + x, 0, width - 1)
+        change += np.abs(now[a, b].astype(float) - then[c, d])
+    return inside & near & (change / 25 < 30)
 
 
 def _nearest_around(depth: np.ndarray, uv: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +156,7 @@ class _Ransac:
         self.start, self._path, self._known = paths.xyz_cam[0], paths.xyz_cam[frames], paths.known[frames]
         self._within = 0.010 * np.maximum(1, self._path[..., 2] ** 2)
         self.length = self._known.sum(0)
-        self._reach = np.where(self._known, np.linalg.norm(self._path - self.start, axis=-1), 0).max(0)
+        self._reach = np.where(self._known, np.linalg.norm(self._path - paths.still[frames], axis=-1), 0).max(0)
 
     def best_hypothesis(
         self, index: np.ndarray, rng: np.random.Generator
