@@ -28,7 +28,7 @@ def test_cells_without_depth_belong_to_nobody() -> None:
     holes = grid.valid.copy()
     holes[5:9, 5:9] = False
     grid = type(grid)(grid.v, grid.u, np.where(holes, grid.depth, 0), holes, grid.edge, grid.moved & holes,
-                      grid.static & holes, grid.undecided & holes)  # fmt: skip
+                      grid.static & holes, grid.undecided & holes, grid.changed & holes)  # fmt: skip
     assignment = assign(scene.pictures, grid, [scene.motion(1)])
     np.testing.assert_array_equal(assignment.best_motion == -1, ~holes)
 
@@ -36,8 +36,8 @@ def test_cells_without_depth_belong_to_nobody() -> None:
 def test_stillness_is_preferred_where_motions_explain_alike() -> None:
     scene = two_plates()
     uv = scene.some_pixels(1, 50)
-    motions = [scene.motion(1)]
-    free, priced = (motion_costs(scene.pictures, motions, uv, scene.points(uv), p) for p in (0.0, 0.5))
+    motions, grid = [scene.motion(1)], segment_motion(scene.pictures)
+    free, priced = (motion_costs(scene.pictures, grid, motions, uv, scene.points(uv), p) for p in (0.0, 0.5))
     path = scene.motion(1).apply(scene.points(uv))
     away = (np.linalg.norm(path[1:] - path[0], axis=-1) > 0.01).mean(0)
     np.testing.assert_allclose(priced - free, 0.5 * away[None], atol=0.04)

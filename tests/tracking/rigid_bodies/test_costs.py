@@ -83,12 +83,15 @@ def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:
     scene = two_plates()
     motions = [scene.motion(k) for k in range(3)]
     R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
-    p, frames = scene.pictures, np.arange(1, FRAMES)
+    p, frames, static = scene.pictures, np.arange(1, FRAMES), scene.owner == 0
     for k in range(3):
         uv = scene.some_pixels(k, 100)
         features = _costs.features_at(p.feature[0], uv.astype(np.float32))
-        cost, moved = _costs.motion_costs(scene.points(uv), features, frames, R, t, p.depth, p.feature, p.K)
+        cost, moved, through = _costs.motion_costs(
+            scene.points(uv), features, frames, R, t, R[0], t[0], static, p.depth, p.feature, p.K
+        )
         assert (cost.argmin(0) == k).mean() > 0.9, k
+        assert through[k].max() < 0.1
         path = np.stack([m.apply(scene.points(uv)) for m in motions])
         away = np.linalg.norm(path[:, 1:] - path[:, :1], axis=-1) > 0.01
         np.testing.assert_allclose(moved, away.mean(1), atol=1.01 / len(frames))  # at the limit, rounding decides

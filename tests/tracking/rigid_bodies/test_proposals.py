@@ -30,7 +30,7 @@ def trajectories(motions: list[RigidMotion], sizes: list[int], strays: int = 0, 
     xyz = np.concatenate([*parts, astray], 1)
     xyz += rng.normal(0, 0.001, xyz.shape)
     pixels = np.stack([np.arange(xyz.shape[1]), np.zeros(xyz.shape[1])], 1).astype(np.int32)
-    return Trajectories(pixels, xyz, np.ones(xyz.shape[:2], bool))
+    return Trajectories(pixels, xyz, np.ones(xyz.shape[:2], bool), np.broadcast_to(xyz[:1], xyz.shape))
 
 
 @settings(max_examples=examples(15), deadline=None, derandomize=True)

@@ -14,6 +14,10 @@ LCN, L, A, B = 0.25 * 3 / 255, 1 / 70, 1 / 30, 1 / 30
 SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
 """Cost of a body's point where the camera looks through it, where something is in front, and where depth is missing."""
 
+BACKGROUND, AS_WELL, COVERED = 0.6, 0.05, 0.4
+"""Least cost of a moved point where the picture shows, as well but for so much, what stood there before; and cost of a
+point that rests, beyond that at which it was last seen, where something came in front."""
+
 
 @numba.njit(cache=True, inline="always")
 def tolerance(z) -> float:
@@ -98,32 +102,33 @@ def energies(points, point_features, R, t, depth, feature, K, every) -> tuple[np
 
 
 @numba.njit(cache=True)
-def motion_costs(points, point_features, frames, R, t, depth, feature, K) -> tuple[np.ndarray, np.ndarray]:
+def motion_costs(points, point_features, frames, R, t, still_R, still_t, static, depth, feature, K) -> tuple:
     """How badly each of B motions explains each of n frame-0 points, over some frames.
 
-    points (n, 3), point_features (n, 4), frames (F,), R (B, T, 3, 3), t (B, T, 3), depth (T, H, W),
-    feature (T, H, W, 4).
-    Returns the mean cost (B, n) and the share of frames (B, n) in which the motion takes the point more than 1 cm.
+    points (n, 3), point_features (n, 4), frames (F,), R (B, T, 3, 3), t (B, T, 3), still_R (T, 3, 3) and still_t
+    (T, 3): how what stands still moves before the camera, static (H, W): what does of the first frame, depth
+    (T, H, W), feature (T, H, W, 4).
+    Returns the mean cost (B, n), and the shares of frames (B, n) in which the motion takes the point more than 1 cm
+    away, and in which the camera looks through where it would be.
     """
-    bodies = len(R)
+    bodies, n = len(R), len(points)
     height, width = depth.shape[1:]
-    cost = np.zeros((bodies, len(points)), np.float32)
-    moved = np.zeros((bodies, len(points)), np.float32)
+    cost, moved, through = np.zeros((3, bodies, n), np.float32)
     share = 1 / len(frames)
-    for b in range(bodies):
-        for f in frames:
-            Q, s = R[b, f], t[b, f]
-            for k in range(len(points)):
-                p = points[k]
-                x = Q[0, 0] * p[0] + Q[0, 1] * p[1] + Q[0, 2] * p[2] + s[0]
-                y = Q[1, 0] * p[0] + Q[1, 1] * p[1] + Q[1, 2] * p[2] + s[1]
-                z = Q[2, 0] * p[0] + Q[2, 1] * p[1] + Q[2, 2] * p[2] + s[2]
-                if (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2 > 1e-4:
+    x, still, last = np.zeros(3), np.zeros(3), np.zeros((bodies, n))
+    for f in frames:
+        for k in range(n):
+            _carry(still_R[f], still_t[f], points[k], still)
+            for b in range(bodies):
+                _carry(R[b, f], t[b, f], points[k], x)
+                away = (x[0] - still[0]) ** 2 + (x[1] - still[1]) ** 2 + (x[2] - still[2]) ** 2 > 1e-4
+                if away:
                     moved[b, k] += share
+                z = x[2]
                 if z <= 0.05:
                     cost[b, k] += 0.55
                     continue
-                u, v = x / z * K[0, 0] + K[0, 2], y / z * K[1, 1] + K[1, 2]
+                u, v = x[0] / z * K[0, 0] + K[0, 2], x[1] / z * K[1, 1] + K[1, 2]
                 if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
                     cost[b, k] += 0.55
                     continue
@@ -131,11 +136,49 @@ def motion_costs(points, point_features, frames, R, t, depth, feature, K) -> tup
                 if farthest == 0:
                     cost[b, k] += 0.35 + 0.5 * color_cost(feature[f], u, v, point_features[k])
                 elif off < tolerance(z):
-                    cost[b, k] += 0.7 * color_cost(feature[f], u, v, point_features[k])
-                    cost[b, k] += 0.35 * min(off / (0.6 * tolerance(z)), 1.0)
+                    color = color_cost(feature[f], u, v, point_features[k])
+                    here = 0.7 * color + 0.35 * min(off / (0.6 * tolerance(z)), 1.0)
+                    if away:
+                        before = _background_cost(x, still_R[f], still_t[f], static, depth[0], feature, f, u, v, K)
+                        if before < color + AS_WELL:
+                            here = max(here, BACKGROUND)
+                    last[b, k] = here
+                    cost[b, k] += here
+                elif nearest > z:
+                    cost[b, k] += 1.4
+                    through[b, k] += share
+                elif away:
+                    cost[b, k] += 0.6
                 else:
-                    cost[b, k] += 1.4 if nearest > z else 0.6
-    return cost * np.float32(share), moved
+                    cost[b, k] += min(COVERED + last[b, k], 0.6)
+    return cost * np.float32(share), moved, through
+
+
+@numba.njit(cache=True, inline="always")
+def _carry(R, t, p, out) -> None:
+    """Where a pose takes a point, into ``out``."""
+    for a in range(3):
+        out[a] = R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2] + t[a]
+
+
+@numba.njit(cache=True)
+def _background_cost(x, R, t, static, depth, feature, f, u, v, K) -> float:
+    """How unlike the static surface, of which x in frame f was a point already in the first frame, pixel (u, v) of
+    frame f looks: 0 to 1, and 2 where x is no such point."""
+    height, width = depth.shape
+    first = np.zeros(3)
+    for a in range(3):
+        first[a] = R[0, a] * (x[0] - t[0]) + R[1, a] * (x[1] - t[1]) + R[2, a] * (x[2] - t[2])
+    z = first[2]
+    if z <= 0.05:
+        return 2.0
+    i = int(np.floor(first[1] / z * K[1, 1] + K[1, 2] + 0.5))
+    j = int(np.floor(first[0] / z * K[0, 0] + K[0, 2] + 0.5))
+    if not (i >= 0 and j >= 0 and i < height and j < width and static[i, j]):
+        return 2.0
+    if abs(depth[i, j] - z) > tolerance(z):
+        return 2.0
+    return color_cost(feature[f], u, v, feature[0, i, j])
 
 
 @numba.njit(cache=True)

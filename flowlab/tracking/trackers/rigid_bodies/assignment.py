@@ -15,6 +15,9 @@ _FRAMES = 32
 """Frames that are looked at."""
 _MOTION_PENALTY = 0.08
 """What a motion costs for the share of frames in which it really moves the point: prefers stillness."""
+_REFUTING_FRAMES, _REFUTED = 3, 0.3
+"""In how many of the frames the camera looks through where a motion would put a point, so that it is another's
+whatever the mean says, and what it costs."""
 _UNKNOWN_COST = 0.9
 _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE = 3, 0.010, 0.35, 2.0
 """Of the mean over neighbors: cells to either side, and the widths in depth [m], color and cells."""
@@ -40,6 +43,7 @@ class BodyAssignment:
 
 def motion_costs(
     pictures: ClipFeatures,
+    grid: MotionGrid,
     motions: Sequence[RigidMotion],
     uv: Num[np.ndarray, "n 2"],
     xyz_cam: Float[np.ndarray, "n 3"],
@@ -49,6 +53,7 @@ def motion_costs(
 
     Args:
         pictures: The clip.
+        grid: What of its first frame stands still: where the pictures show that, nothing else is.
         motions: B of them.
         uv: The points' pixels.
         xyz_cam: Their positions [m].
@@ -57,10 +62,13 @@ def motion_costs(
     frames = np.unique(np.linspace(1, len(pictures) - 1, min(len(pictures) - 1, _FRAMES)).round().astype(int))
     features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
     R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
-    cost, moved = _costs.motion_costs(xyz_cam, features, frames, R, t, pictures.depth, pictures.feature, pictures.K)
-    if pictures.still is not None:  # what moves before the camera alone does not move
-        moved[[k for k, m in enumerate(motions) if m is pictures.still]] = 0
-    return cost + motion_penalty * moved
+    static = grid.in_pixels(grid.static, pictures.depth.shape[1:])
+    still = pictures.stillness
+    cost, moved, through = _costs.motion_costs(
+        xyz_cam, features, frames, R, t, still.R, still.t, static, pictures.depth, pictures.feature, pictures.K
+    )
+    refuted = through * len(frames) >= _REFUTING_FRAMES
+    return cost + np.float32(motion_penalty) * moved + np.float32(_REFUTED) * refuted
 
 
 def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMotion]) -> BodyAssignment:
@@ -70,7 +78,7 @@ def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMoti
     raw[0] = 0
     uv = grid.pixels(grid.undecided)
     xyz = pictures.unproject(uv.astype(float), grid.depth[grid.undecided].astype(float))
-    raw[:, grid.undecided] = motion_costs(pictures, every, uv, xyz)
+    raw[:, grid.undecided] = motion_costs(pictures, grid, every, uv, xyz)
     feature = pictures.feature[0, ::STEP, ::STEP]
     cost = _surfaces.aggregate(
         raw, grid.undecided, grid.valid, grid.depth, feature, _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE

@@ -73,7 +73,7 @@ def _merit(fit: RigidBodyFit, owner: Int64[np.ndarray, "h w"], pair: tuple[int, 
     uv = fit.grid.pixels(region)
     xyz = fit.pictures.unproject(uv.astype(float), fit.grid.depth[region].astype(float))
     motions = [fit.bodies[a - 1].motion, fit.bodies[b - 1].motion, motion]
-    cost = motion_costs(fit.pictures, motions, uv, xyz, motion_penalty=0.0)
+    cost = motion_costs(fit.pictures, fit.grid, motions, uv, xyz, motion_penalty=0.0)
     return float((np.where(owner[region] == a, cost[0], cost[1]) - cost[2]).mean())
 
 

@@ -49,6 +49,10 @@ class MotionGrid:
         """(u, v) of the cells of a mask."""
         return np.stack([self.u[mask], self.v[mask]], 1)
 
+    def in_pixels(self, mask: Bool[np.ndarray, "h w"], size: tuple[int, ...]) -> Bool[np.ndarray, "H W"]:
+        """A mask of cells as one of the pixels that are theirs."""
+        return mask.repeat(STEP, 0).repeat(STEP, 1)[: size[0], : size[1]]
+
     def components(self, mask: Bool[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
         """The connected parts of a mask, the largest first; depth jumps divide them."""
         cell = np.arange(mask.size).reshape(mask.shape)

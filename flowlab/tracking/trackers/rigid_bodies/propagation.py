@@ -10,11 +10,14 @@ from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+from flowlab.tracking.trackers.rigid_bodies.proposals import flow
 
 _OWN_WEIGHT = 0.7
 """Weight of a point's own cost against one cell's that looks exactly like it."""
 _REFINE_FRAMES, _REFINE_PRIOR = 4, 3.0
 """Frames to either side over which readings of the surface are averaged, and the weight of no shift among them."""
+_LEAST_TEXTURE, _FLOW_NOISE_PX = 2e-3, 0.1
+"""Optical flow is believed where there is this much texture, and where it differs by more than this."""
 _COST_SCALE = 0.06
 """A cost this much higher explains a point almost as well."""
 
@@ -31,6 +34,8 @@ class PropagatedTracks:
     """How badly that explains the point; 0 is perfect, 1 is nothing like it."""
     spread: Float64[np.ndarray, "T M"]
     """How far [m] the motions that explain the point almost as well would put it from there."""
+    slip: Float64[np.ndarray, "T M"]
+    """How far [m] optical flow has led away from there."""
     residual: Float32[np.ndarray, "T M"]
     """How badly color and depth fit at that very frame, 0 to 1; where the point is hidden, its cost."""
 
@@ -44,7 +49,7 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
         z: Their depths there [m].
     """
     xyz = fit.pictures.unproject(uv.astype(float), z.astype(float))
-    cost = _smooth_costs(fit, uv, z, motion_costs(fit.pictures, fit.motions, uv, xyz))
+    cost = _smooth_costs(fit, uv, z, motion_costs(fit.pictures, fit.grid, fit.motions, uv, xyz))
     motion = cost.argmin(0)
     every = np.stack([m.apply(xyz) for m in fit.motions])
     path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
@@ -53,7 +58,7 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
     belief = np.exp(-(cost - least) / _COST_SCALE)
     belief /= belief.sum(0)
     spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
-    return PropagatedTracks(path, seen, motion, least, spread, _residual(fit, uv, path, seen, least))
+    return PropagatedTracks(path, seen, motion, least, spread, _slip(fit, path, seen), _residual(fit, uv, path, seen, least))
 
 
 def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
@@ -71,6 +76,22 @@ def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np
     smooth = total / (weight + _REFINE_PRIOR)
     smooth[0] = 0
     return path * (1 + smooth / np.maximum(z, 0.05))[..., None]
+
+
+def _slip(fit: RigidBodyFit, path: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """How far [m] optical flow has led away (T, M) from the paths, where the points are seen: steps of both are compared
+    in every frame, and added up, since what is left behind by a wrong path is not seen there any more."""
+    uv, z = fit.pictures.project(path), path[..., 2]
+    slip = np.zeros_like(path[..., :2])
+    for t in range(1, len(path)):
+        slip[t] = slip[t - 1]
+        mine = np.flatnonzero(seen[t - 1] & seen[t])
+        if len(mine):
+            to, found = flow(fit.pictures, t, uv[t - 1, mine], _LEAST_TEXTURE)
+            off = to - uv[t, mine]
+            found &= np.linalg.norm(off, axis=1) > _FLOW_NOISE_PX
+            slip[t, mine[found]] += off[found]
+    return np.linalg.norm(slip, axis=-1) * z / fit.pictures.K[0, 0]
 
 
 def _residual(fit: RigidBodyFit, uv: np.ndarray, path: np.ndarray, seen: np.ndarray, cost: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ _FRAMES, _HYPOTHESES, _NEIGHBORS = 24, 60, 14
 _INLIER = 0.75
 """Share of its known frames in which a trajectory must follow a motion to belong to it."""
 _flow: Any = cv2.calcOpticalFlowPyrLK  # by its stub the guess could not be None
-_LK = {"winSize": (15, 15), "maxLevel": 3, "criteria": (3, 20, 0.01), "minEigThreshold": 1e-5}
+_LK = {"winSize": (15, 15), "maxLevel": 3, "criteria": (3, 20, 0.01)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +44,17 @@ class Trajectories:
 
 
 def flow(
-    pictures: ClipFeatures, t: int, uv: Num[np.ndarray, "n 2"]
+    pictures: ClipFeatures, t: int, uv: Num[np.ndarray, "n 2"], least_texture: float = 1e-5
 ) -> tuple[Float32[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
-    """Where pixels (n, 2) of frame t - 1 are in frame t, and which of them come back when followed back."""
+    """Where pixels (n, 2) of frame t - 1 are in frame t, and which of them come back when followed back.
+
+    What has less texture, as OpenCV's least eigenvalue tells it, is not followed.
+    """
     before, after = (pictures.feature[k, :, :, 1].copy() for k in (t - 1, t))
     p = np.ascontiguousarray(uv, np.float32)
-    q, found, _ = _flow(before, after, p, None, **_LK)
-    back, found_back, _ = _flow(after, before, q, None, **_LK)
+    options = {**_LK, "minEigThreshold": least_texture}
+    q, found, _ = _flow(before, after, p, None, **options)
+    back, found_back, _ = _flow(after, before, q, None, **options)
     height, width = pictures.depth.shape[1:]
     inside = (q >= 0).all(1) & (q[:, 0] <= width - 1) & (q[:, 1] <= height - 1)
     return q, inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm(back - p, axis=1) < 1)

@@ -33,7 +33,7 @@ class RigidBodies(Tracker):
 
     max_depth: float = Field(default=4.0, gt=0)
     """Depth beyond this [m] counts as missing."""
-    unexplained: float = Field(default=0.9, gt=0)
+    unexplained: float = Field(default=1.2, gt=0)
     """Mean cost above which a motion does not explain a point."""
     seed: int = 0
     """Of the random choices; the same seed gives the same tracks."""
@@ -53,7 +53,8 @@ class RigidBodiesSession:
     def track(self, queries_txy: Float32[np.ndarray, "M 3"], start: int, stop: int) -> Tracks2D:
         """See :class:`~flowlab.tracking.base.Session`; one fit is made for each frame that has queries.
 
-        ``disagreement`` is how far apart the motions that explain a point almost as well would put it.
+        ``disagreement`` is how far apart the motions that explain a point almost as well would put it, or optical
+        flow does, if that is more.
         """
         tracks = _blank(stop - start, queries_txy[:, 1:])
         frame = queries_txy[:, 0].astype(int)
@@ -123,11 +124,12 @@ def _modeled(pictures: ClipFeatures, carried: PropagatedTracks, of: np.ndarray) 
     xy = np.clip(pictures.to_clip_pixels(pictures.project(xyz)), -size, 2 * size)
     cost = np.broadcast_to(carried.cost[of], z.shape)
     focal = pictures.K[0, 0] * pictures.factor
+    apart = np.maximum(carried.spread[:, of], carried.slip[:, of])
     return Tracks2D(
         xy.astype(np.float32),
         seen & ahead,
         (1 - cost).clip(0, 1).astype(np.float32),
-        disagreement=(carried.spread[:, of] * focal / np.maximum(z, 0.05)).astype(np.float32),
+        disagreement=(apart * focal / np.maximum(z, 0.05)).astype(np.float32),
         xyz_cam=np.where(ahead[..., None], xyz, 0).astype(np.float32),
         residual=carried.residual[:, of],
     )
