@@ -19,6 +19,9 @@ _REFUTING_FRAMES, _REFUTED = 3, 0.3
 """In how many of the frames the camera looks through where a motion would put a point, so that it is another's
 whatever the mean says, and what it costs."""
 _UNKNOWN_COST = 0.9
+_DOUBTFUL, _DOUBTED_COST, _SPREADS, _PLAIN_SCALE = 0.2, 0.5, 5, 0.08
+"""Cells whose best motions differ by less, and of which one explains them, take the cost of their surroundings of the
+same color: in so many rounds, with so narrow a width in color."""
 _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE = 3, 0.010, 0.35, 2.0
 """Of the mean over neighbors: cells to either side, and the widths in depth [m], color and cells."""
 
@@ -83,7 +86,24 @@ def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMoti
     cost = _surfaces.aggregate(
         raw, grid.undecided, grid.valid, grid.depth, feature, _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE
     )
+    if len(every) > 1:
+        _decide_by_surroundings(raw, cost, grid, feature)
     return BodyAssignment(raw, cost)
+
+
+def _decide_by_surroundings(raw: np.ndarray, cost: np.ndarray, grid: MotionGrid, feature: np.ndarray) -> None:
+    """Spread costs (B, h, w) over plain surfaces, in place: what slides along itself looks as if it stood still, but for
+    its border."""
+    best, second = np.partition(cost[:, grid.undecided], 1, axis=0)[:2]
+    open_to_doubt = grid.undecided.copy()
+    open_to_doubt[grid.undecided] = (second - best < _DOUBTFUL) & (best < _DOUBTED_COST)
+    settled = np.where(np.isfinite(cost), cost, 0)
+    for _ in range(_SPREADS):
+        settled = _surfaces.aggregate(
+            settled, open_to_doubt, grid.valid, grid.depth, feature, _REACH, _DEPTH_SCALE, _PLAIN_SCALE, _REACH
+        )
+        settled[~np.isfinite(settled)] = 0
+    cost[:, open_to_doubt] = raw[:, open_to_doubt] = settled[:, open_to_doubt]
 
 
 def select_needed(assignment: BodyAssignment, margin: float = 0.10) -> list[int]:

@@ -20,6 +20,8 @@ _CHANGE_COST = np.array([[0.75 / 255, 0.5 / 70, 1 / 30, 1 / 30]], np.float32) * 
 """What one count of each feature channel's change costs, in sixteenths; shadows change lightness, which counts less."""
 _CHANGED, _CHANGED_SHARE = 0.35 * 16, 0.08
 """A cell looks different in a frame if it costs more, and has changed if it does in this share of the frames."""
+_PLAIN_BAND, _PLAIN = 30, 6
+"""The same, where neighbors differ by less than this count in lightness and color."""
 _UNDECIDED_BAND = 6
 """Cells around what moves in which the motion is decided by cost, not by having stayed."""
 
@@ -88,7 +90,8 @@ def segment_motion(pictures: ClipFeatures) -> MotionGrid:
     changed = valid & (recolored >= max(3, _CHANGED_SHARE * steps))
     changed &= cv2.boxFilter(changed.astype(np.float32), -1, (3, 3), normalize=False) >= 3
     static &= ~changed
-    undecided = (valid & ~static) | _grow(moved, z, valid)
+    plain = _grow(moved, z, valid, pictures.feature[0, ::STEP, ::STEP])
+    undecided = (valid & ~static) | _grow(moved, z, valid) | plain
     return MotionGrid(v, u, z, valid, _edges(pictures.depth[0])[::STEP, ::STEP], moved, static, undecided, changed)
 
 
@@ -149,12 +152,14 @@ def _textured(pictures: ClipFeatures) -> np.ndarray:
     return cv2.blur(gray * gray, (9, 9)) - mean * mean > 64
 
 
-def _grow(mask: np.ndarray, z: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The mask and the cells within reach of it over unbroken surface."""
-    for _ in range(_UNDECIDED_BAND):
+def _grow(mask: np.ndarray, z: np.ndarray, valid: np.ndarray, feature: np.ndarray | None = None) -> np.ndarray:
+    """The mask and the cells within reach of it over unbroken surface; farther, where features say one color."""
+    for _ in range(_UNDECIDED_BAND if feature is None else _PLAIN_BAND):
         grown = mask.copy()
         for near, far in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
             same = np.abs(z[near] - z[far]) < 0.02 * np.maximum(1, z[far])
+            if feature is not None:
+                same &= cv2.absdiff(feature[near], feature[far])[..., 1:].max(-1) < _PLAIN
             grown[near] |= mask[far] & same
             grown[far] |= mask[near] & same
         mask = grown & valid
