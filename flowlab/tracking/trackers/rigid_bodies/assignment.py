@@ -11,7 +11,7 @@ from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
-_FRAMES = 32
+_FRAMES = 24
 """Frames that are looked at."""
 _MOTION_PENALTY = 0.08
 """What a motion costs for the share of frames in which it really moves the point: prefers stillness."""

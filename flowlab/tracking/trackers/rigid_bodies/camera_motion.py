@@ -9,8 +9,10 @@ from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import MotionGrid, segment_motion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import track_poses
 
-_POINTS = 1500
+_POINTS = 1000
 """Points the whole scene is followed by."""
+_SOME_FRAMES = 3
+"""Every how many frames are enough to tell roughly what stands still."""
 _MIN_STATIC_SHARE = 0.25
 """Of the scene that must be found to stand still before a motion that is to be the camera's."""
 
@@ -34,10 +36,10 @@ def with_camera_motion(
     if pictures.still is not None or grid.static.any() or not grid.valid.any():
         return pictures, grid
     scene = new_body(pictures, grid, grid.valid)
-    for _ in range(2):
+    for every in (_SOME_FRAMES, 1):
         scene = track_poses(pictures, [scene], rng, _POINTS)[0]
         moving = replace(pictures, still=scene.motion)
-        found = segment_motion(moving)
+        found = segment_motion(moving, every)
         if found.static.sum() < _MIN_STATIC_SHARE * found.valid.sum():
             return pictures, grid
         scene = changed_body(moving, found, found.static, scene.motion)

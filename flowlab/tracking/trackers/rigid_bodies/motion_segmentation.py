@@ -70,18 +70,22 @@ class MotionGrid:
         return [label == name for name in names[np.argsort(-counts, kind="stable")]]
 
 
-def segment_motion(pictures: ClipFeatures) -> MotionGrid:
+def segment_motion(pictures: ClipFeatures, every: int = 1) -> MotionGrid:
     """Sort the cells of the first frame into static, moved and unknown, by what every later frame shows there.
 
     Free space seen where a surface was means that it moved; something in front of it only hides it. Where less than
     a quarter of the scene stays, the camera moves, and nothing is static.
+
+    Args:
+        pictures: The clip.
+        every: Every how many frames are looked at.
     """
     height, width = pictures.depth.shape[1:]
     v, u = (x.astype(np.int32) for x in np.mgrid[0:height:STEP, 0:width:STEP])
     z = pictures.depth[0, ::STEP, ::STEP]
-    through, near, unlike, late, recolored = _count_evidence(pictures, z)
-    valid, steps = z > 0, len(pictures) - 1
-    moved = valid & (through >= max(2, 0.03 * len(pictures)))
+    through, near, unlike, late, recolored = _count_evidence(pictures, z, every)
+    valid, steps = z > 0, len(range(1, len(pictures), every))
+    moved = valid & (through >= max(2, 0.03 * steps))
     moved &= cv2.boxFilter(moved.astype(np.float32), -1, (3, 3), normalize=False) >= 3
     looks_different = (unlike / np.maximum(near, 1) > 64) & _textured(pictures)[::STEP, ::STEP]
     static = valid & ~moved & (near >= 0.25 * steps) & (late >= 0.5 * (1 - _LATE_SHARE) * steps) & ~looks_different
@@ -95,12 +99,12 @@ def segment_motion(pictures: ClipFeatures) -> MotionGrid:
     return MotionGrid(v, u, z, valid, _edges(pictures.depth[0])[::STEP, ::STEP], moved, static, undecided, changed)
 
 
-def _count_evidence(pictures: ClipFeatures, z: np.ndarray) -> tuple[np.ndarray, ...]:
+def _count_evidence(pictures: ClipFeatures, z: np.ndarray, every: int) -> tuple[np.ndarray, ...]:
     """In how many later frames the camera looks through each cell of depth z (h, w) [m], in how many the surface is
     there still, how much it looks unlike the first frame in those together, in how many of the last it is, and in how
     many it has another color."""
     through, near, unlike, late, recolored = np.zeros((5, *z.shape))
-    for t in range(1, len(pictures)):
+    for t in range(1, len(pictures), every):
         depth, feature, z = _as_first_seen(pictures, t)
         within = 0.010 * np.maximum(1, z * z)
         low, high = (x[::STEP, ::STEP] for x in depth[1:])

@@ -106,6 +106,8 @@ def track_poses(
     for t in range(1, frames):
         batch.last_center = _rotate(R[t - 1], batch.center) + s[t - 1]
         poses = _easy_guesses(bodies, t, R, s, (seen_R, seen_s))
+        if pictures.still is not None:
+            poses = _with_stillness(pictures.still, t, R[t - 1], s[t - 1], poses)
         best = _BestPoses(*_choose(batch.energies(t, *poses), *poses))
         hard = np.flatnonzero((best.energy > _HIGH_ENERGY) | (best.energy > energy + _ENERGY_RISE))
         if len(hard):
@@ -117,6 +119,16 @@ def track_poses(
         good = (best.seen > 0.4) & (energy < 0.5)
         seen_R[good], seen_s[good] = R[t, good], s[t, good]
     return [replace(b, motion=RigidMotion(R[:, k], s[:, k])) for k, b in enumerate(bodies)]
+
+
+def _with_stillness(
+    still: RigidMotion, t: int, last_R: np.ndarray, last_s: np.ndarray, poses: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses to try, and those of bodies that stay where they were in the frame before, though the camera moves."""
+    R_step = still.R[t] @ still.R[t - 1].T
+    s_step = still.t[t] - R_step @ still.t[t - 1]
+    R, s = R_step @ last_R, _rotate(R_step, last_s) + s_step
+    return np.concatenate([poses[0], R[:, None]], 1), np.concatenate([poses[1], s[:, None]], 1)
 
 
 def _easy_guesses(
