@@ -1,10 +1,13 @@
 """Which body a pixel belongs to, against scenes in which that is known."""
 
+from dataclasses import replace
+
+import moving_planes
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from rigid_body_scenes import two_plates
+from rigid_body_scenes import scene, two_plates
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, assign, motion_costs, select_needed
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
@@ -41,6 +44,18 @@ def test_stillness_is_preferred_where_motions_explain_alike() -> None:
     path = scene.motion(1).apply(scene.points(uv))
     away = (np.linalg.norm(path[1:] - path[0], axis=-1) > 0.01).mean(0)
     np.testing.assert_allclose(priced - free, 0.5 * away[None], atol=0.04)
+
+
+def test_free_space_in_a_few_frames_refutes_stillness() -> None:
+    """Whatever the mean says: here things rest until the last five frames."""
+    frames, late = 24, np.maximum(np.arange(24) - 18, 0)[:, None]
+    plate = moving_planes.moving((0.2, 0.2), (0, 0, 0.8), np.zeros(3), np.zeros(3), frames, 1)
+    film = scene([moving_planes.wall(1.2, frames), replace(plate, t=plate.t + late * [0.03, 0, 0])])
+    uv, grid = film.some_pixels(1, 60), segment_motion(film.pictures)
+    still, moved = motion_costs(film.pictures, grid, [film.pictures.stillness, film.motion(1)], uv, film.points(uv))
+    gone = uv[:, 0] < uv[:, 0].min() + 4
+    assert gone.sum() >= 3
+    assert (still - moved)[gone].min() > 0.3
 
 
 def volume(*costs: float) -> BodyAssignment:

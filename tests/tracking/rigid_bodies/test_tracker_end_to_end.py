@@ -63,6 +63,18 @@ def test_follows_things_that_move_differently(noise: float, within: float) -> No
         assert tracks.visible.mean() > 0.5
 
 
+@pytest.mark.parametrize("z", [0.75, 0.994])
+def test_a_board_that_slides_before_a_wall_is_not_left_standing(z: float) -> None:
+    """Nor one so thin that depth does not tell it from the wall."""
+    frames = 20
+    board = moving_planes.moving((0.25 * z, 0.3 * z), (-0.15, 0, z), np.array([z / 72, 0, 0]), np.zeros(3), frames, 1)
+    scene = [moving_planes.wall(1.0, frames), board]
+    clip, owner = moving_planes.film(scene, noise=0.001)
+    for k in (0, 1):
+        error, _ = errors(scene, clip, owner, queries(owner, k, 16))
+        assert (error[-1] < 0.02).mean() > 0.9, k
+
+
 def test_does_not_drift() -> None:
     scene = two_plates()
     clip, owner = moving_planes.film(scene)

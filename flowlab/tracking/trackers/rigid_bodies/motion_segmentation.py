@@ -83,12 +83,14 @@ def segment_motion(pictures: ClipFeatures, every: int = 1) -> MotionGrid:
     height, width = pictures.depth.shape[1:]
     v, u = (x.astype(np.int32) for x in np.mgrid[0:height:STEP, 0:width:STEP])
     z = pictures.depth[0, ::STEP, ::STEP]
-    through, near, unlike, late, recolored = _count_evidence(pictures, z, every)
+    through, near, unlike, late, recolored, looked, looked_late = _count_evidence(pictures, z, every)
     valid, steps = z > 0, len(range(1, len(pictures), every))
+    if pictures.still is None:  # what a camera at rest does not see is no surface
+        looked, looked_late = np.full(z.shape, steps), np.full(z.shape, (1 - _LATE_SHARE) * steps)
     moved = valid & (through >= max(2, 0.03 * steps))
     moved &= cv2.boxFilter(moved.astype(np.float32), -1, (3, 3), normalize=False) >= 3
     looks_different = (unlike / np.maximum(near, 1) > 64) & _textured(pictures)[::STEP, ::STEP]
-    static = valid & ~moved & (near >= 0.25 * steps) & (late >= 0.5 * (1 - _LATE_SHARE) * steps) & ~looks_different
+    static = valid & ~moved & (near >= 0.25 * np.maximum(looked, 3)) & (late >= 0.5 * looked_late) & ~looks_different
     if static.sum() < _MIN_STATIC_SHARE * valid.sum():
         static[:] = False  # the camera moves: what looks the same does so by chance
     changed = valid & (recolored >= max(3, _CHANGED_SHARE * steps))
@@ -102,8 +104,8 @@ def segment_motion(pictures: ClipFeatures, every: int = 1) -> MotionGrid:
 def _count_evidence(pictures: ClipFeatures, z: np.ndarray, every: int) -> tuple[np.ndarray, ...]:
     """In how many later frames the camera looks through each cell of depth z (h, w) [m], in how many the surface is
     there still, how much it looks unlike the first frame in those together, in how many of the last it is, and in how
-    many it has another color."""
-    through, near, unlike, late, recolored = np.zeros((5, *z.shape))
+    many it has another color; and in how many, of all and of the last, anything is read there."""
+    through, near, unlike, late, recolored, looked, looked_late = np.zeros((7, *z.shape))
     for t in range(1, len(pictures), every):
         depth, feature, z = _as_first_seen(pictures, t)
         within = 0.010 * np.maximum(1, z * z)
@@ -114,12 +116,15 @@ def _count_evidence(pictures: ClipFeatures, z: np.ndarray, every: int) -> tuple[
         there &= (np.abs(d - z) < within) | (np.abs(low - z) < within) | (np.abs(high - z) < within)
         through += seen_through
         near += there
-        late += there & (t >= _LATE_SHARE * len(pictures))
+        is_late = t >= _LATE_SHARE * len(pictures)
+        late += there & is_late
+        looked += high > 0
+        looked_late += (high > 0) & is_late
         change = cv2.absdiff(feature, pictures.feature[0])
         unlike += there * cv2.blur(change[..., 0], (5, 5))[::STEP, ::STEP]
         cost = cv2.transform(cv2.blur(change, (3, 3)), _CHANGE_COST)[::STEP, ::STEP]
         recolored += there & (cost > _CHANGED)
-    return through, near, unlike, late, recolored
+    return through, near, unlike, late, recolored, looked, looked_late
 
 
 def _as_first_seen(pictures: ClipFeatures, t: int) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
