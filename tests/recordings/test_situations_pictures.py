@@ -120,6 +120,46 @@ def test_one_reading_that_stays_while_others_vary_is_none(
     assert re.search(words, says), says
 
 
+def patched(frames: Frames, value: Callable[[np.ndarray, int], object]) -> Frames:
+    """A patch of each picture filled anew."""
+    hole = np.zeros(SIZE[::-1], bool)
+    hole[10:40, 10:45] = True
+    return [(rgb, np.where(hole, value(depth, t), depth)) for t, (rgb, depth) in enumerate(frames)]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [lambda d, t: d.max(), lambda d, t: np.quantile(d, 0.4 + 0.03 * t), lambda d, t: 0.9 + 0.01 * t],
+    ids=["greatest", "middle", "another"],
+)
+def test_holes_that_were_filled_are_no_readings(
+    still: Frames, tmp_path: Path, capsys: Capture, value: Callable[[np.ndarray, int], object]
+) -> None:
+    folder = put(tmp_path / "r", patched(still[:6], value), intrinsics=GIVEN, T_world_cam=None)
+    _, found, _ = verdicts(capsys, folder)
+    verdict, says = found["saturated depth"]
+    assert (verdict, "15% of the pixels have one reading" in says) == ("doubtful", True)
+    rng = np.random.default_rng(0)
+    few = patched(still[:6], lambda d, t: np.where(rng.random(d.shape) < 0.1, d.max(), d))
+    assert said(capsys, tmp_path / "few", "saturated depth", few)[0] == "ok"
+
+
+def test_codes_at_the_end_of_16_bits_are_no_readings(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    rng = np.random.default_rng(0)
+    odd = patched(still[:3], lambda d, t: 65.531 + 0.001 * rng.integers(0, 5, d.shape))
+    folder = put(tmp_path / "r", odd, intrinsics=GIVEN, T_world_cam=None)
+    found = verdicts(capsys, folder)[1]
+    assert found["saturated depth"][0] == "assumed"
+    assert "100% within" in found["depth unit"][1]
+
+
+def test_depth_in_wide_steps_is_doubtful(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    for step, expected in ((0.1, "doubtful"), (0.04, "doubtful"), (0.005, "ok")):
+        wide = [(rgb, np.rint(depth / step) * step) for rgb, depth in still[:3]]
+        verdict, says = said(capsys, tmp_path / f"{step}", "depth unit", wide)
+        assert (verdict, f"in steps of {1000 * step:g} mm" in says) == (expected, True)
+
+
 def test_readings_beyond_what_is_sensed_are_doubtful(still: Frames, tmp_path: Path, capsys: Capture) -> None:
     rng = np.random.default_rng(0)
     for name, near, far in (("far", 65.4, 65.5), ("near", 0.09, 0.11)):
