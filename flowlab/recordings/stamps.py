@@ -118,7 +118,7 @@ def _units(step: float, bounds: tuple[float, float]) -> list[Unit]:
 def _by_step(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None) -> Unit | Literal["frames"]:
     """The unit in which a step is plausible, and agrees with ``fps``."""
     step = _step(stamps)
-    numbers = timing.integers and not step > LARGEST_COUNT
+    numbers = timing.integers and not step > LARGEST_COUNT and _counts(stamps, step)
     units: list[Unit | Literal["frames"]] = [
         u for u in _units(step, PICTURE_STEP_S) if np.max(np.abs(stamps)) * SECONDS[u] <= _LONGEST_S
     ]
