@@ -11,6 +11,7 @@ from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, motion_checks, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
+from flowlab.recordings.pose_steps import check_steps
 from flowlab.recordings.poses import check_known, poses_at
 from flowlab.recordings.repeats import find_repeats
 from flowlab.recordings.sync import nearest_sample
@@ -137,7 +138,8 @@ def check_frames(
     T_world_cam = None
     if streams.poses is not None and poses is not None:
         T_world_cam, _ = poses_at(streams.poses, streams.color.time_s[rows[:, 0]], pose_gap_s)
-        checks += (check_known(streams.poses, poses[1], pose_gap_s),)
+        shown = tuple(streams.color.names[i] for i in rows[:, 0])
+        checks += (check_known(streams.poses, poses[1], pose_gap_s), check_steps(T_world_cam, shown))
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))

@@ -206,6 +206,25 @@ def test_depth_that_fits_nowhere_is_doubtful(
     assert verdict in ("doubtful", "refused"), says
 
 
+@pytest.mark.parametrize(
+    ("turn", "how"),
+    [
+        ((slice(None, None, -1), slice(None)), "upside down"),
+        ((slice(None), slice(None, None, -1)), "mirrored"),
+        ((slice(None, None, -1), slice(None, None, -1)), "turned by half a turn"),
+    ],
+)
+@pytest.mark.parametrize("eye", [(0.5, -0.7, 0.6), (-0.4, -0.8, 0.5)])
+def test_depth_that_is_turned_is_told_how(
+    tmp_path: Path, capsys: Capture, turn: tuple[slice, slice], how: str, eye: tuple[float, float, float]
+) -> None:
+    frames = filmed(lambda t: looking(eye), count=3)
+    assert said(capsys, tmp_path / "ok", "registration", frames)[0] == "ok"
+    verdict, says = said(capsys, tmp_path / "r", "registration", [(rgb, depth[turn]) for rgb, depth in frames])
+    assert verdict in ("doubtful", "refused")
+    assert f"as if depth were {how} (" in says
+
+
 def test_pictures_without_edges_tell_nothing_of_registration(still: Frames, tmp_path: Path, capsys: Capture) -> None:
     rng = np.random.default_rng(0)
     for name, level, noise in (("white", 200, 3), ("gray", 128, 12)):
