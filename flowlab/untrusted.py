@@ -6,11 +6,13 @@ Every reader of text, JSON and YAML goes through here; arrays through :mod:`flow
 import json
 import os
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from flowlab.errors import DataError, MissingFileError, first_line
 from flowlab.limits import MAX_NESTING, MAX_TEXT_BYTES, MAX_YAML_BYTES, MAX_YAML_NODES
+from flowlab.text import shown
 
 _RESTORE = "restore it or extract again into a new folder"
 
@@ -127,12 +129,24 @@ def _unfolded(node: Any, known: dict[int, int], depth: int) -> int:
         return 1
     if depth > MAX_NESTING:
         raise ValueError("it is nested too deep")
+    if isinstance(node, yaml.MappingNode):
+        _check_once([key for key, _ in node.value if isinstance(key, yaml.ScalarNode)])
     if id(node) not in known:
         inner = [x for pair in node.value for x in pair] if isinstance(node, yaml.MappingNode) else node.value
         known[id(node)] = 1 + sum(_unfolded(x, known, depth + 1) for x in inner)
     if known[id(node)] > MAX_YAML_NODES:
         raise ValueError(f"its aliases stand for more than {MAX_YAML_NODES:,} values")
     return known[id(node)]
+
+
+def _check_once(keys: Sequence[Any]) -> None:
+    """Refuse a key that stands twice: YAML forbids it, and PyYAML takes the last without a word."""
+    lines: dict[str, int] = {}
+    for key in keys:
+        line = key.start_mark.line + 1
+        if key.value in lines:
+            raise ValueError(f"{shown(key.value)} stands twice, in lines {lines[key.value]} and {line}; keep one")
+        lines[key.value] = line
 
 
 def _yaml_words(error: Any) -> str:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
 from flowlab.policies.checkpoint import newest_checkpoint, read_trained, step_of
-from flowlab.policies.run_folder import read_run_config
+from flowlab.policies.run_folder import read_resume, read_run_config
 from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
 from flowlab.training import run
@@ -117,11 +118,16 @@ def _train(data: Path, folder: Path, settings: TrainSettings, device: str) -> No
 
 
 def _finished(folder: Path) -> bool:
-    """Whether a run has come to its last step."""
+    """Whether a run has come to its last step; not where a kill left its resume file behind its last weights."""
     try:
-        return step_of(newest_checkpoint(folder)) >= read_run_config(folder).steps
+        steps = read_run_config(folder).steps
+        if step_of(newest_checkpoint(folder)) < steps:
+            return False
     except DataError:
         return False
+    with suppress(DataError):  # finished runs are kept without it, too
+        return read_resume(folder)[0] >= steps
+    return True
 
 
 def _extract(

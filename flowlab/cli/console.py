@@ -1,6 +1,7 @@
 """What the commands print: text from files is never markup, nor an escape of the terminal, nor a further line."""
 
 import json
+import math
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
@@ -56,8 +57,17 @@ def print_tables(tables: Sequence["ReportTable"]) -> None:
 
 
 def print_json(values: Any) -> None:
-    """One JSON document on standard output."""
-    click.echo(json.dumps(values, indent=1))
+    """One JSON document on standard output; what is no finite number is null, as JSON has none."""
+    click.echo(json.dumps(_finite(values), indent=1, allow_nan=False))
+
+
+def _finite(values: Any) -> Any:
+    """Nested values, null in place of numbers that are not finite."""
+    if isinstance(values, dict):
+        return {name: _finite(value) for name, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [_finite(value) for value in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
 EPISODES_LINE = "{what}: {done} of {total} episodes, {spent:.0f} s{left}"

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from flowlab.arguments import check_path, check_paths, check_settings
 from flowlab.engines.base import StartEngine
-from flowlab.errors import FlowlabError, UsageError
+from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.pipeline.filling import engine_for, fill
 from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler
 from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.recordings.identity import difference, identity
-from flowlab.recordings.metadata import FILE_NAME, combine, load_metadata
+from flowlab.recordings.metadata import FILE_NAME, load_metadata
 from flowlab.recordings.recording import RecordingSettings, find_recordings
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest
@@ -124,9 +124,13 @@ def recording_stage(recipe: Recipe) -> RecordingStage:
 
 
 def _task_said(path: Path, settings: RecordingSettings) -> str | None:
+    """What the task is called by the calibration file, or by a recording's own."""
     beside = [path / FILE_NAME] if path.is_dir() else [path.with_suffix(".yaml"), path.parent / FILE_NAME]
-    files = [*([settings.calibration] if settings.calibration else []), *(f for f in beside if f.is_file())]
-    return combine((str(f), load_metadata(f)) for f in files)[0].task
+    said = [load_metadata(settings.calibration).task] if settings.calibration else []
+    for file in filter(Path.is_file, beside):
+        with suppress(DataError):  # opening it will say what is wrong, of it alone
+            said.append(load_metadata(file).task)
+    return next((task for task in said if task is not None), None)
 
 
 def label_recordings(

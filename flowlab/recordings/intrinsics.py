@@ -15,9 +15,24 @@ _COUNTS = (0, 4, 5, 8, 12, 14)
 
 
 class FiniteSettings(Settings):
-    """Settings whose numbers are finite."""
+    """Settings whose numbers are finite, and no ``true`` that would be taken for 1."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truths(cls, values: Any) -> Any:
+        if isinstance(values, dict):
+            for name, value in values.items():
+                field = cls.model_fields.get(name)
+                if field is not None and field.annotation is not bool and _holds_truth(value):
+                    raise ValueError(f"'{name}' holds true or false, expected numbers or words")
+        return values
+
+
+def _holds_truth(value: Any) -> bool:
+    """Whether a value of YAML is ``true`` or ``false``, or a list of some depth that holds one."""
+    return isinstance(value, bool) or (isinstance(value, list) and any(map(_holds_truth, value)))
 
 
 def _coefficients(values: tuple[float, ...]) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from flowlab.config import Settings
 from flowlab.errors import DataError, unknown_name
 from flowlab.recordings.intrinsics import FiniteSettings, Intrinsics
-from flowlab.recordings.stamps import StatedUnit
+from flowlab.recordings.stamps import PICTURE_STEP_S, StatedUnit
 from flowlab.text import cut, is_path_inside, shown
 from flowlab.untrusted import read_yaml
 
@@ -65,7 +65,7 @@ class Metadata(FiniteSettings):
     """Folder of the color pictures."""
     depth: PathInside = "depth"
     """Folder of the depth pictures."""
-    fps: float | None = Field(default=None, gt=0)
+    fps: float | None = Field(default=None, ge=1 / PICTURE_STEP_S[1], le=1 / PICTURE_STEP_S[0])
     """Pictures per second, where their names number frames; where there are times, these must agree."""
     times: PathInside | None = None
     """File with the time of every color picture [s], one a line; of the depth pictures too without ``depth_times``."""

@@ -24,6 +24,7 @@ from flowlab.benchmark.recipe import load_experiment
 from flowlab.benchmark.units import plan_units
 from flowlab.checksums import with_checksum
 from flowlab.cli import main
+from flowlab.policies.run_folder import read_resume, save_resume
 from flowlab.storage.dataset import Dataset
 
 Capture = pytest.CaptureFixture[str]
@@ -209,6 +210,18 @@ def test_a_unit_that_is_lost_is_done_again_alone(
     for name, (content, _) in after.items():
         if name.startswith(("runs", "data")):
             assert content == before[name][0], name
+
+
+def test_a_run_killed_between_its_last_weights_and_its_resume_file_is_brought_to_its_end(
+    experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = Path(shutil.copytree(experiment, tmp_path / "killed"))
+    (out / "units" / f"{UNITS[0]}.json").unlink()
+    run = out / "runs" / UNITS[0]
+    _, groups = read_resume(run)
+    save_resume(run, 1, groups)
+    assert bench(capsys, out, recipe, "--workers", "1")[0] == 0
+    assert read_resume(run)[0] == 2
 
 
 def test_what_was_made_with_other_settings_is_refused_with_the_difference(

@@ -224,6 +224,23 @@ def test_a_dry_run_names_gaps_bad_frames_and_what_is_missing(
     assert "no recording can be labeled" in output
 
 
+def test_a_recording_yaml_that_cannot_be_read_costs_its_own_recording_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k, name in enumerate(("good", "bad")):
+        record(tmp_path / "slide" / name, frames=4, seed=k)
+    with (tmp_path / "slide" / "bad" / "recording.yaml").open("a") as file:
+        file.write("success: false\n")
+    code, out, _ = call_cli(capsys, "track-real", tmp_path / "slide", "--dry-run", "--json")
+    bad, good = json.loads(out)["recordings"]
+    assert code == 3
+    assert "'success' stands twice, in lines" in bad["problem"]
+    assert (good["rows"], good["problem"]) == (4, None)
+    code, out, err = call_cli(capsys, "track-real", tmp_path / "slide", "--out", tmp_path / "data", *SMALL)
+    assert len(Dataset(tmp_path / "data")) == 1
+    assert "'success' stands twice" in out + err
+
+
 def test_short_options_are_settings(recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.yaml").write_text("depth_unit_m: 0.002\n")
     command = ["track-real", recordings / "1", "--out", tmp_path / "d", *SMALL, "--workers", "1", "--task", "x"]

@@ -69,11 +69,12 @@ def test_episodes_are_the_first_successful_seeds_in_order(small_dataset: Path) -
     assert all(x["reason"].startswith("solved for") for x in lines)
 
 
+@pytest.mark.parametrize("moments", [(1,), pytest.param((1, 3), marks=pytest.mark.slow)], ids=str)
 def test_killed_at_any_moment_it_opens_and_the_same_command_finishes_it(
-    flowlab: Cli, small_dataset: Path, tmp_path: Path
+    moments: tuple[int, ...], flowlab: Cli, small_dataset: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "killed"
-    for receipts_before_kill in (1, 3):
+    for receipts_before_kill in moments:
         run = start(out)
         wait_until(lambda n=receipts_before_kill: len(list(out.glob("receipts/*.json"))) >= n)
         os.kill(run.pid, signal.SIGKILL)

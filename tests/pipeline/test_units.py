@@ -137,7 +137,7 @@ def _no_summaries() -> Iterator[None]:
         yield
 
 
-MANY = (40, 70) if THOROUGH else (48,)
+MANY = (40, 70) if THOROUGH else (32,)
 
 
 def first_round_names(task: str, wanted: int, first_seed: int) -> set[str]:

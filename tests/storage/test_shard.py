@@ -391,7 +391,9 @@ for k in range(rounds):
 """
 
 
-@pytest.mark.parametrize("over", [False, True], ids=["fresh", "over an old shard"])
+@pytest.mark.parametrize(
+    "over", [pytest.param(False, marks=pytest.mark.slow), True], ids=["fresh", "over an old shard"]
+)
 def test_a_writer_that_is_killed_leaves_a_whole_shard_or_none(tmp_path: Path, over: bool) -> None:
     """Killed at random moments of the write, in many rounds."""
     rounds = 40
