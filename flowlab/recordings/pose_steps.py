@@ -34,7 +34,7 @@ def check_steps(T: Float[np.ndarray, "T 4 4"], names: tuple[str, ...]) -> Check:
         return Check("steps of poses", Verdict.DOUBTFUL, f"{says}; correct them, or leave them out of the file")
     count = come_again(T)
     if count:
-        says = (f"{count} of {len(T)} poses equal the one before, in many places: they are taken less often than the "
+        says = (f"{count} of {len(T)} poses equal the one before, in many places: they are rarer than the "
                 "pictures; give the times of the poses themselves, between which those of pictures are found")  # fmt: skip
         return Check("steps of poses", Verdict.DOUBTFUL, says)
     return Check("steps of poses", Verdict.OK, "no pose leaps away and back")
