@@ -16,8 +16,8 @@ _BESIDE = 1.0
 """And so many times as far as its neighbors are apart."""
 _SAME = 1e-7
 """Poses that differ by less are one."""
-_TWICE = 0.25
-"""More poses than this share equal the one before, in runs of a few: tracking is slower than the pictures."""
+_RARER, _STEADY = 1.8, 0.9
+"""So many rows come to a new pose at least, as evenly as whole rows can in this share."""
 
 
 def check_steps(T: Float[np.ndarray, "T 4 4"], names: tuple[str, ...]) -> Check:
@@ -34,17 +34,20 @@ def check_steps(T: Float[np.ndarray, "T 4 4"], names: tuple[str, ...]) -> Check:
         return Check("steps of poses", Verdict.DOUBTFUL, f"{says}; correct them, or leave them out of the file")
     count = come_again(T)
     if count:
-        says = (f"{count} of {len(T)} poses equal the one before, in many places: they are rarer than the "
-                "pictures; give the times of the poses themselves, between which those of pictures are found")  # fmt: skip
+        says = (f"{count} of {len(T)} poses equal the one before, at even steps: they are rarer than the "
+                "pictures; give the poses' own times, between which those of pictures are found")  # fmt: skip
         return Check("steps of poses", Verdict.DOUBTFUL, says)
     return Check("steps of poses", Verdict.OK, "no pose leaps away and back")
 
 
 def come_again(T: Float[np.ndarray, "T 4 4"]) -> int:
-    """How many poses equal the one before; 0 where that is no habit, as of a camera that rests."""
+    """How many poses equal the one before, where new ones come rarely but steadily; 0 of a camera that rests."""
     again = (np.abs(np.diff(T, axis=0)) < _SAME).all((1, 2))
-    places = int((np.diff(np.concatenate([[0], again])) == 1).sum())
-    return int(again.sum()) if len(T) >= _FEWEST and places > _TWICE / 2 * len(T) and again.mean() > _TWICE else 0
+    every = np.diff(np.flatnonzero(np.concatenate([[True], ~again])))
+    if len(T) < _FEWEST or len(every) < _FEWEST // 2 or every.mean() < _RARER:
+        return 0
+    steady = np.isin(every, np.floor(every.mean()) + np.arange(2)).mean() >= _STEADY
+    return int(again.sum()) if steady else 0
 
 
 def leaps(T: Float[np.ndarray, "T 4 4"]) -> Int64[np.ndarray, "L"]:

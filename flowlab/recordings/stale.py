@@ -23,6 +23,8 @@ _QUIET = 0.75
 """Share of the pixels, those that change least, by which noise is measured beside a thing that moves."""
 _BELOW = 0.7
 """Pictures that change by less than this share of their film's noise are one, encoded anew."""
+_EVEN = 1.5
+"""Noise changes pictures by about the same from one to the next."""
 
 
 def older_pictures(kept: Sequence[PictureDigest], noisy: bool, change: Float64[np.ndarray, "N"]) -> dict[int, int]:
@@ -106,5 +108,7 @@ def encoded_anew(kept: Sequence[PictureDigest]) -> list[tuple[int, int]]:
     others = np.concatenate([[True], ~low])
     if not found or not has_noise(small[others]):
         return []
-    floor = float(np.quantile(quiet[~low], 0.05))
+    floor, most = np.quantile(quiet[~low], (0.05, 0.9))
+    if most > _EVEN * floor:  # it is motion that changes them, which may stop
+        return []
     return [(a, b) for a, b in found if quiet[a:b].max() < _BELOW * floor]
