@@ -126,7 +126,7 @@ SLOWS_DOWN = [int(t) for t in np.cumsum([0, *[8] * 10, 6, 4, 2, *[0] * 26])]
         lambda: shown(range(FRAMES), pan=3),
         lambda: shown(SLOWS_DOWN, noise=0.0, pan=0.5),  # a camera that stops
         lambda: [(film(max(t, 12), 0.0)[0], film(max(t, 12), 2.0, seed=t)[1]) for t in range(FRAMES)],
-        lambda: shown([6 - abs(t % 12 - 6) for t in range(FRAMES)], noise=0.0),  # to and fro, in a renderer
+        lambda: shown([6 - abs(t % 12 - 6) for t in range(FRAMES)], noise=0.0),  # back and forth, in a renderer
         lambda: encoded([(film(12, seed=t)[0], film(12, seed=t)[1]) for t in range(FRAMES)], [85] * FRAMES),
     ],
 )
