@@ -45,7 +45,7 @@ def truth(xyz_world: np.ndarray, frames: int) -> np.ndarray:
 def record(folder: Path, frames: int = 20, seed: int = 0, **more: object) -> Path:
     """Write the film as a recording of a robot with a state of two numbers."""
     rgb, depth = film(frames, seed)
-    state = np.stack([np.arange(frames), np.arange(frames) ** 2], -1).astype(np.float32)
+    state = np.stack([0.3 * np.arange(frames), np.arange(frames) ** 2], -1).astype(np.float32)
     values = {"rgb": rgb, "depth": depth, "camera": CAMERA, "time_s": np.arange(frames) / FPS, "state": state, **more}
     write_rgbd_recording(folder, **values)  # type: ignore[arg-type]
     return folder

@@ -3,10 +3,35 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 SIGMA_EDGES_MM = (0.0, *(float(2 ** (k / 2)) for k in range(-2, 15)), float("inf"))
 """Limits of the bins of stated error, two to an octave: 0, 0.5, 0.71, 1, ... 128, and no limit."""
+
+
+CONFIDENTLY_WRONG = (0.02, 4.0)
+"""An error is confidently wrong above so many meters and so many times the stated one."""
+
+
+def confidently_wrong(
+    error_m: Float[np.ndarray, "*batch"], sigma_m: Float[np.ndarray, "*batch"], seen: Bool[np.ndarray, "*batch"]
+) -> float:
+    """How often labels are far off without saying so: the worst that can happen to who trusts them.
+
+    Args:
+        error_m: True errors [m]; not a number where there is no answer, which claims nothing.
+        sigma_m: Stated ones [m].
+        seen: Positions that count: those in sight, or said to be.
+
+    Returns:
+        The share of these whose error is above ``CONFIDENTLY_WRONG``; not a number where none counts.
+    """
+    if not seen.any():
+        return float("nan")
+    least_m, sigmas = CONFIDENTLY_WRONG
+    with np.errstate(invalid="ignore"):
+        wrong = (error_m > least_m) & (error_m > sigmas * sigma_m)
+    return float(wrong[seen].mean())
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from flowlab.errors import DataError
 from flowlab.grading import ground_truth
 from flowlab.grading.calibration import Calibration, calibrate
-from flowlab.grading.ground_truth import GroundTruth, unusable_queries
+from flowlab.grading.ground_truth import GroundTruth, scene_of, unusable_queries
 from flowlab.grading.metrics import (
     EstimatedTracks,
     TrackMetrics,
@@ -37,6 +37,8 @@ class RecordingGrade:
     """One recording, labeled by one tracker."""
 
     recording: str
+    scene: str
+    """The family of procedural scenes or the task that it is of; empty for a recording of somebody's own."""
     frames: int
     queries: int
     unusable_queries: int
@@ -54,7 +56,7 @@ class RecordingGrade:
 
     def to_json(self) -> dict[str, Any]:
         """The figures, without the tracks, as JSON values."""
-        facts = {name: getattr(self, name) for name in ("recording", "frames", "queries", "unusable_queries")}
+        facts = {name: getattr(self, name) for name in ("recording", "scene", "frames", "queries", "unusable_queries")}
         times = {"cpu_s": round(self.cpu_s, 3), "ms_per_frame": round(self.ms_per_frame, 2)}
         return {**facts, **times, "metrics": self.metrics.to_json()}
 
@@ -79,12 +81,19 @@ class TrackerGrade:
         """CPU time per frame over all recordings [ms]."""
         return sum(row.cpu_s for row in self.rows) / sum(row.frames for row in self.rows) * 1e3
 
+    def by_scene(self) -> dict[str, TrackMetrics]:
+        """The mean over the recordings of each family of scenes, or task; of what is neither, nothing."""
+        names = dict.fromkeys(row.scene for row in self.rows if row.scene)
+        groups = {name: [row for row in self.rows if row.scene == name] for name in names}
+        return {name: average([r.metrics for r in rows], _calibration(rows)) for name, rows in groups.items()}
+
     def to_json(self) -> dict[str, Any]:
         """All figures as JSON values."""
         return {
             **self.tracker,
             "ms_per_frame": round(self.ms_per_frame, 2),
             "mean": self.mean.to_json(),
+            "scenes": {name: mean.to_json() for name, mean in self.by_scene().items()},
             "recordings": [row.to_json() for row in self.rows],
         }
 
@@ -133,6 +142,7 @@ def grade_recording(
     cpu_s = time.process_time() - start
     return RecordingGrade(
         recording=recording.name,
+        scene=scene_of(recording),
         frames=len(clip),
         queries=len(truth.query_px),
         unusable_queries=unusable_queries(recording),

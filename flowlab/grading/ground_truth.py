@@ -1,13 +1,15 @@
 """True tracks beside a recording, and how they are read: ``ground_truth.npz``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int8
+from jaxtyping import Bool, Float32, Float64, Int8
 
 from flowlab.array_files import load_arrays
 from flowlab.errors import DataError, MissingFileError
+from flowlab.geometry.camera import pose_fault
+from flowlab.geometry.transforms import apply
 from flowlab.recordings.metadata import TRUE_TRACKS
 from flowlab.records import Role
 from flowlab.text import cut, natural_key, shown
@@ -30,12 +32,25 @@ class GroundTruth:
     """Whether the camera sees the point."""
     role: Int8[np.ndarray, "N"] | None = None
     """The :class:`flowlab.records.Role` of what each query lies on, -1 where it is not known. None where
-    "moving" means nothing, because it is the camera that moves."""
+    "moving" means nothing, because it is the camera that moves in a way that is not known."""
+    T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    """The pose of a camera that moves, at each instant: what moves is what moves in the world."""
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays as they are stored, by name."""
-        named = {"query_px": self.query_px, "tracks_cam": self.tracks_cam, "visible": self.visible}
-        return named if self.role is None else {**named, "role": self.role}
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: values for name, values in named.items() if values is not None}
+
+    def save(self, recording: Path) -> None:
+        """Write the tracks beside a recording."""
+        np.savez_compressed(recording / FILE_NAME, **self.arrays())  # type: ignore[arg-type]
+
+    def displacement_m(self) -> Float64[np.ndarray, "T N"]:
+        """How far every point is from where it started [m]: in the world, where the camera's motion is known."""
+        xyz = self.tracks_cam.astype(np.float64)
+        if self.T_world_cam is not None:
+            xyz = apply(self.T_world_cam[:, None], xyz)
+        return np.asarray(np.linalg.norm(xyz - xyz[:1], axis=-1))
 
 
 def has_ground_truth(recording: Path) -> bool:
@@ -58,6 +73,15 @@ def find_with_truth(path: Path) -> list[Path]:
             "without recordings of your own, give --tasks hammer,door-open"
         )
     return found
+
+
+def scene_of(recording: Path) -> str:
+    """The family of scenes, or the task, that a simulated recording is of; empty for any other."""
+    made = recording / MADE_WITH
+    values = read_json(made, "simulate it again") if made.is_file() else {}
+    made_with = values.get("made_with") if isinstance(values, dict) else None
+    found = (made_with.get("scenes") or made_with.get("task")) if isinstance(made_with, dict) else ""
+    return found if isinstance(found, str) else ""
 
 
 def unusable_queries(recording: Path) -> int:
@@ -106,11 +130,17 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> GroundTruth:
         if not (role.min() >= -1 and role.max() <= max(Role)):
             raise DataError(f"{path}: 'role' is {role.min()} to {role.max()}, expected -1 to {int(max(Role))}")
         role = role.astype(np.int8)
+    poses = arrays.get("T_world_cam")
+    if poses is not None:
+        _check(path, "T_world_cam", poses, (steps, 4, 4), "f")
+        poses = poses.astype(np.float64)
+        if fault := next(filter(None, map(pose_fault, poses)), ""):
+            raise DataError(f"{path}: a pose of 'T_world_cam' {fault}")
     with np.errstate(over="ignore"):
         query_px, tracks_cam = query_px.astype(np.float32), tracks_cam.astype(np.float32)
     for name, values in (("query_px", query_px), ("tracks_cam", tracks_cam)):
         _check(path, name, values, values.shape, "f")
-    return GroundTruth(query_px, tracks_cam, arrays["visible"], role)
+    return GroundTruth(query_px, tracks_cam, arrays["visible"], role, poses)
 
 
 def _check(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str) -> None:

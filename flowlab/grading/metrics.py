@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32
 
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.moving import MOVING_IN_RECORDING_M
-from flowlab.grading.calibration import Calibration, calibrate
+from flowlab.grading.calibration import Calibration, calibrate, confidently_wrong
 from flowlab.grading.ground_truth import GroundTruth
 from flowlab.grading.tapvid import MetricSettings, TapVid3D, tapvid
 from flowlab.records import Role
@@ -68,6 +68,9 @@ class TrackMetrics:
     """How far into the recording a point gets before it is lost, as a share, on average over the points."""
     survival_moving: float | None
     tapvid: TapVid3D
+    confidently_wrong: float | None
+    """Share of positions in sight, or said to be, that are far off and do not say so; see
+    :func:`~flowlab.grading.calibration.confidently_wrong`. None where no sigma is stated."""
     calibration: Calibration | None
     """None where no sigma is stated."""
 
@@ -96,6 +99,9 @@ def measure(
         survival=float(survived.mean()),
         survival_moving=float(survived[moving].mean()) if moving.any() else None,
         tapvid=_tapvid(error, estimate.visible, truth, camera, settings or MetricSettings()),
+        confidently_wrong=None
+        if estimate.sigma is None
+        else confidently_wrong(error[1:], estimate.sigma[1:], (truth.visible | estimate.visible)[1:]),
         calibration=None if estimate.sigma is None else calibrate(error[1:], estimate.sigma[1:]),
     )
 
@@ -121,7 +127,7 @@ def _motion(truth: GroundTruth) -> tuple[Bool[np.ndarray, "N"], Bool[np.ndarray,
     """Which points move at all, and when they are away from where they started."""
     if truth.role is None:
         return np.zeros(truth.visible.shape[1], bool), np.zeros(truth.visible.shape, bool)
-    away = np.linalg.norm(truth.tracks_cam.astype(np.float64) - truth.tracks_cam[:1], axis=-1)
+    away = truth.displacement_m()
     moving = away.max(0) > MOVING_IN_RECORDING_M
     return moving, moving & (away > MOVED_M)
 

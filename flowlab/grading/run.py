@@ -52,10 +52,11 @@ def grade(
     *,
     trackers: Sequence[str] | str = ("rigid-bodies",),
     tasks: Sequence[str] | str = (),
+    scenes: Sequence[str] | str = (),
     episodes: int = 1,
     seed: int = 0,
-    sensor: str = "kinect",
-    size: tuple[int, int] = (320, 240),
+    sensor: str | None = None,
+    size: tuple[int, int] | None = None,
     settings: Sequence[str] = (),
     weights: Path | None = None,
     chunks: ChunkSettings = ChunkSettings(),
@@ -68,10 +69,12 @@ def grade(
         out: Folder to write: ``grade.json``, and the simulated recordings, which the next run uses again.
         trackers: Names of trackers, or import paths ``module:Class``.
         tasks: MetaWorld's tasks, or groups of them, whose experts are recorded by a simulated depth camera.
-        episodes: Recordings of each task.
-        seed: Of the first of them.
-        sensor: What the simulated camera errs like, ``kinect`` or ``clean``.
-        size: Width and height of its pictures [px].
+        scenes: Families of procedural scenes that are filmed (see :mod:`flowlab.grading.scenes`), or ``all``.
+        episodes: Recordings of each task and family.
+        seed: Of the first of them. Films of seeds from 1000 on are for reporting: no tracker may be made with them.
+        sensor: What the simulated camera errs like: ``kinect``, ``stereo``, ``tof`` or ``clean``. Without it tasks are
+            recorded by a Kinect, and every film's seed chooses.
+        size: Width and height of its pictures [px]. Without it tasks have 320 x 240, and every film's seed chooses.
         settings: ``key=value`` of every tracker's options, or ``tracker.key=value`` of one tracker's.
         weights: File of a learned tracker's weights.
         chunks: How a recording is cut for trackers that take it in parts.
@@ -85,16 +88,23 @@ def grade(
         DataError: A recording cannot be read, or its truth is not known.
         FlowlabError: The folder cannot be written, or a library is missing.
     """
-    recordings, tasks = check_paths(recordings, "recordings"), check_names(tasks, "tasks")
+    recordings = check_paths(recordings, "recordings")
+    tasks, scenes = check_names(tasks, "tasks"), check_names(scenes, "scenes")
     trackers, settings = check_names(trackers, "trackers"), check_settings(settings, form=_SETTINGS_FORM)
     episodes, seed, out = check_count(episodes, "episodes"), check_count(seed, "seed", 0), check_path(out, "out")
-    if not recordings and not tasks:
-        raise UsageError("nothing to grade; give folders with a ground_truth.npz, or --tasks hammer,door-open")
+    if not recordings and not tasks and not scenes:
+        raise UsageError(
+            "nothing to grade; give folders with a ground_truth.npz, --scenes tabletop,hands or --tasks hammer,push"
+        )
     made = [make_graded_tracker(name, trackers, settings, weights) for name in dict.fromkeys(trackers)]
     folders = [folder for path in recordings for folder in find_with_truth(path)]
-    simulated = None
+    simulated: dict[str, Any] = {}
+    seeds = range(seed, seed + episodes)
     if tasks:
-        more, simulated = _simulate(tasks, range(seed, seed + episodes), sensor, size, out, on_progress)
+        more, simulated["tasks"] = _simulate(tasks, seeds, sensor or "kinect", size or (320, 240), out, on_progress)
+        folders += more
+    if scenes:
+        more, simulated["scenes"] = _film(scenes, seeds, sensor, size, out, on_progress)
         folders += more
     folders = list({folder.resolve(): folder for folder in folders}.values())
 
@@ -105,7 +115,7 @@ def grade(
     for tracker in made:
         on_progress(f"labeling with {tracker.name}")
         results.append(grade_tracker(folders, tracker, chunks, LiftSettings(), report=tell))
-    report = GradingReport(chunks, simulated, tuple(results))
+    report = GradingReport(chunks, simulated or None, tuple(results))
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / REPORT, report.to_json())
@@ -151,6 +161,31 @@ def _simulate(
             with _writing(out):
                 made = simulate_recording(folder, task, seed, how)
             on_progress(f"{folder}: {'recorded' if made else 'there already'}")
+            folders.append(folder)
+    return folders, how.model_dump(mode="json")
+
+
+def _film(
+    names: Sequence[str],
+    seeds: range,
+    sensor: str | None,
+    size: tuple[int, int] | None,
+    out: Path,
+    on_progress: Callable[[str], None],
+) -> tuple[list[Path], dict[str, Any]]:
+    """Film what is not there yet; the folders of all, and how they are made."""
+    load_mujoco()
+    from flowlab.grading.scenes.families import FAMILIES
+    from flowlab.grading.scenes.film import FilmSettings, make_film
+
+    how = FilmSettings(sensor=sensor, size=size)
+    folders = []
+    for family in FAMILIES if list(names) == ["all"] else names:
+        for seed in seeds:
+            folder = out / "recordings" / f"{family}-{seed}"
+            with _writing(out):
+                made = make_film(folder, family, seed, how)
+            on_progress(f"{folder}: {'filmed' if made else 'there already'}")
             folders.append(folder)
     return folders, how.model_dump(mode="json")
 

@@ -80,6 +80,10 @@ class Streams:
     """What the reader looked at, and what came of it."""
     used: tuple[str, ...] | None = None
     """The files and folders below a recording that it is made of; None where the reader does not say."""
+    passed_over: tuple[tuple[str, str], ...] = ()
+    """Patterns of files that the layout has and that are rightly not used, and why."""
+    unread: tuple[str, ...] = ()
+    """Keys of files that are used, as ``file:key``, which nothing reads; ``checks`` say so."""
     poses: SampleStream | None = None
     """Of a color camera that moves, see :func:`flowlab.recordings.poses.pose_stream`."""
 

@@ -109,7 +109,14 @@ def _not_in_pixels(given: Intrinsics, size: _Size) -> _Fault | None:
     parts += [f"cx {given.cx:g} and cy {given.cy:g}"] * (c_shares or middle)
     says = f"{', '.join(parts)} {_MEANT[c_shares or (f_shares and focal is not None), f_shares, middle]}"
     f_px = "fx: ..., fy: ..." if focal is None else f"fx: {focal[0]:.6g}, fy: {focal[1]:.6g}"
-    return Verdict.REFUSED, f"{says};", f"{{{f_px}, cx: {center[0]:.6g}, cy: {center[1]:.6g}}}"
+    cx, cy = (_likely(c, own, side) for c, own, side in zip(center, (given.cx, given.cy), size, strict=True))
+    return Verdict.REFUSED, f"{says};", f"{{{f_px}, cx: {cx}, cy: {cy}}}"
+
+
+def _likely(c: float, own: float, side: int) -> str:
+    """A coordinate of a principal point to write: as found, as given, or as a share, if one may be right."""
+    found = next((x for x in (c, own, own * side - 0.5) if abs((x + 0.5) / side - 0.5) <= _OFF_AXIS[0]), None)
+    return "..." if found is None else f"{found:.6g}"
 
 
 def _focal_px(given: Intrinsics, size: _Size) -> tuple[float, float] | None:

@@ -10,7 +10,6 @@ from flowlab.recordings.motion_check import check_motion
 from flowlab.recordings.number_check import check_numbers
 from flowlab.recordings.pose_check import check_poses_fit
 from flowlab.recordings.registration_check import check_registration
-from flowlab.recordings.unused_times import check_unused_times
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.recordings.world_check import check_world
 
@@ -24,7 +23,6 @@ def check_recording(source: "ParsedRecording") -> Iterator[Check]:
     yield from check_widths_known(source)
     yield from check_numbers(source)
     yield from find_left_out(source)
-    yield from check_unused_times(source)
 
 
 def _geometry(source: "ParsedRecording") -> Iterator[Check]:

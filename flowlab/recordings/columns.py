@@ -1,8 +1,10 @@
 """The columns of a table by what they are, times or numbers of a robot; what may be either is asked for."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,9 +19,15 @@ _TIMES = {
     "unixtime", "walltime", "rostime", "timesec", "headerstamp", "fieldheaderstamp", "rosbagtimestamp", "elapsed",
 }  # fmt: skip
 """What columns of times are called, without their unit, case and signs."""
-_COUNTS = {"", "index", "frame", "frames", "seq", "id", "row", "no", "unnamed0", "step", "sample", "fieldheaderseq"}
+_COUNTS = {
+    "", "index", "idx", "frame", "frames", "seq", "id", "row", "no", "nr", "unnamed0", "step", "sample",
+    "fieldheaderseq", "counter", "count", "cnt", "number", "num", "n",
+}  # fmt: skip
 """What columns that number the rows are called."""
 _FRAMES = {"frame", "frames", "framenumber", "frameno", "frameid", "frameindex", "frameidx", "framecount"}
+_FRAMES |= {
+    f"{what}{word}" for what in ("image", "img", "picture") for word in ("", "number", "no", "nr", "id", "idx", "index")
+}
 """What columns with the numbers of the pictures' frames are called."""
 _UNITS = {
     "s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3, "millis": 1e-3,
@@ -52,6 +60,8 @@ class Columns:
     values: Float64[np.ndarray, "N D"]
     are_frames: bool = False
     """Whether the times are numbers of frames, those of the pictures."""
+    are_stamps: bool = False
+    """Whether the times are the stamps of the pictures that the rows name."""
 
 
 def find_columns(
@@ -61,6 +71,7 @@ def find_columns(
     color_s: np.ndarray,
     timed: bool,
     numbered: bool = False,
+    pictures: Mapping[str, float] = MappingProxyType({}),
 ) -> Columns:
     """The times of a table and the numbers that are the state, or the action.
 
@@ -71,6 +82,7 @@ def find_columns(
         color_s: Times of the color pictures.
         timed: Whether the rows have their times in another file.
         numbered: Whether the pictures' names number frames, so that rows may have the numbers of theirs.
+        pictures: Stamps of the color pictures by the names of their files, so that rows may name theirs.
 
     Raises:
         DataError: Columns that are chosen do not exist, or it is not clear which are meant.
@@ -78,27 +90,49 @@ def find_columns(
     pair = _whole_and_part(table)
     times = [k for k, n in enumerate(table.names) if base_and_unit(n)[0] in _TIMES]
     times = [*pair[:1], *(k for k in times if k not in pair)]
-    frames = _frame_numbers(table) if numbered and not (times or timed) else []
-    rest = [k for k in range(table.values.shape[1]) if k not in (*times[:1], *pair, *frames)]
+    files = [] if timed else [k for k, cells in table.words.items() if {file_stem(c) for c in cells} <= pictures.keys()]
+    frames = _frame_numbers(table) if numbered and not (times or timed or files) else []
+    rest = [
+        k for k in range(table.values.shape[1]) if k not in (*times[: None if files else 1], *pair, *frames, *files)
+    ]
     if chosen is not None:
         rest = [table.column(n) for n in chosen]
     time, known = _own_time(table, pair, times or frames)
+    if files:
+        time, known = np.array([pictures[file_stem(cell)] for cell in table.words[files[0]]]), False
     if chosen is None or table.text & set(rest):
         rows_s = time if known else color_s if len(color_s) == len(table.values) and not (timed or times) else None
         doubts = _doubts(table, rest, times, color_s, timed)
-        doubts = {
-            k: c.why for c in find_clocks(table.values, table.names, rows_s) if (k := c.place) in rest and c.certain
-        } | doubts
-        _check_meaning(table, name, rest, doubts)
+        found = find_clocks(table.values[:, rest], [table.names[k] for k in rest] if table.names else (), rows_s)
+        doubts = {rest[c.place]: c.why for c in found if c.certain} | doubts
+        _check_meaning(table, name, rest, doubts, numbered)
     names = tuple(table.names[k] for k in rest) if table.names else ()
-    return Columns(time, known, names, table.values[:, rest], bool(frames))
+    columns = Columns(time, known, names, table.values[:, rest], bool(frames), bool(files))
+    return _in_order(table, (*files, *frames)[0], columns) if files or frames else columns
+
+
+def _in_order(table: SampleTable, column: int, found: Columns) -> Columns:
+    """The rows in the order of their pictures. Raises :class:`DataError` where two are of one."""
+    assert found.time is not None
+    order = np.argsort(found.time, kind="stable")
+    time = found.time[order]
+    if len(time) > 1 and (twice := np.flatnonzero(np.diff(time) == 0)).size:
+        first, second = (int(order[twice[0] + k]) + 1 for k in (0, 1))
+        says = f"column {cut(repr(table.names[column]))} names one picture in the rows {first} and {second}"
+        raise DataError(f"{table.path}: {says}, expected one row for each")
+    return replace(found, time=time, values=found.values[order])
+
+
+def file_stem(name: str) -> str:
+    """The name of a picture's file without its folders and its ending."""
+    return PurePath(name.replace("\\", "/")).stem
 
 
 def _frame_numbers(table: SampleTable) -> list[int]:
     """The column with the number of each row's frame; none where there is none, or several may be it."""
     called = [k for k, n in enumerate(table.names) if plain_name(n) in _FRAMES]
     columns = table.values[:, called]
-    return called if len(called) == 1 and _rises(columns[:, 0]) and (columns % 1 == 0).all() else []
+    return called if len(called) == 1 and (columns % 1 == 0).all() else []
 
 
 def _own_time(table: SampleTable, pair: Sequence[int], times: Sequence[int]) -> tuple[np.ndarray | None, bool]:
@@ -140,33 +174,45 @@ def _doubts(
     """The columns that are no numbers of a robot, or may be none, and why."""
     doubtful = dict.fromkeys(times[1:], "is a time, too")
     doubtful |= {k: "is a part of a time" for k in rest if table.names and plain_name(table.names[k]) in _PARTS}
-    doubtful |= {k: "holds text" for k in rest if k in table.text}
-    doubtful |= {k: "counts the rows" for k in rest if table.names and plain_name(table.names[k]) in _COUNTS
+    doubtful |= {k: _of_text(table.words.get(k, ())) for k in rest if k in table.text}
+    doubtful |= {k: "counts the rows" for k in rest if table.names and _is_count(table.names[k])
                  and _rises(table.values[:, k])}  # fmt: skip
     if not times and not timed and not table.names and _is_clock(table, color_s):
         doubtful[0] = "rises like a clock"
     return {k: why for k, why in doubtful.items() if k in rest}
 
 
-def _check_meaning(table: SampleTable, name: str, rest: Sequence[int], doubts: dict[int, str]) -> None:
+def _is_count(name: str) -> bool:
+    """Whether a column is called as numbers of rows are; a name in other letters than a to z is not known."""
+    return plain_name(name) in _COUNTS and (plain_name(name) != "" or not any(map(str.isalpha, name)))
+
+
+def _of_text(cells: Sequence[str]) -> str:
+    """What is said of a column of text; of names of files that they are not those of the color pictures."""
+    if not cells or not all(cell.lower().endswith((".png", ".jpg", ".jpeg")) for cell in cells):
+        return "holds text"
+    return f"names files of which not all are color pictures ({cut(cells[0])} to {cut(cells[-1])})"
+
+
+def _check_meaning(table: SampleTable, name: str, rest: Sequence[int], doubts: dict[int, str], numbered: bool) -> None:
     """Refuse a table with columns that may be no numbers of a robot, with what to write."""
     if not doubts:
         return
     k, why = next(iter(sorted(doubts.items())))
     raise DataError(
         f"{table.path}: column {cut(repr(table.names[k])) if table.names else k + 1} {why}; "
-        f"{_advice(table, name, [i for i in rest if i not in doubts])}"
+        f"{_advice(table, name, [i for i in rest if i not in doubts], numbered)}"
     )
 
 
-def _advice(table: SampleTable, name: str, others: Sequence[int]) -> str:
+def _advice(table: SampleTable, name: str, others: Sequence[int], numbered: bool) -> str:
     """What to write where a column may be a time."""
     if table.names:
         some = cut(", ".join(repr(table.names[k]) for k in others), 400)
         return (
             f"name those of the {name}, in order: '{name}_columns: [{some}]', and if it is the time of the rows, call it "  # noqa: E501
             "'time', with its unit as in 'time [ms]'"
-        )
+        ) + (", if it is the number of the row's picture, 'frame'" if numbered else "")
     if table.path.suffix.lower() == ".npy":
         return (
             f"if it is the time, write it into a file of its own, named as '{name}_times', and the rest without it; "

@@ -12,6 +12,7 @@ _BY_SUFFIX = {
     (".r3d",): f"is a recording of Record3D, which is not read; unzip it, and {_PLAIN}",
     (".mkv",): f"is a video (of an Azure Kinect, say), which is not read; unpack it with 'ffmpeg -i', and {_PLAIN}",
     (".mp4", ".avi", ".mov"): f"is a video, which is not read, and holds no depth; {_PLAIN}",
+    (".sens",): f"is of ScanNet, a format that is not read; {_PLAIN}, or an .npz file per episode",
     (".svo", ".svo2", ".oni", ".rrd", ".tfrecord", ".parquet", ".klg"): f"is of a format that is not read; {_PLAIN}",
     (".zst", ".zstd"): "is compressed; unpack it with 'zstd -d FILE'",
     (".bz2",): "is compressed; unpack it with 'bunzip2 -k FILE'",

@@ -1,150 +1,160 @@
-"""Files of a recording that no stream uses: each is named, with the reason."""
+"""What of a recording no stream uses: each file is harmless, ignored as stated, or asked about."""
 
-import re
-from collections.abc import Iterator
-from pathlib import Path
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flowlab.array_files import load_array
-from flowlab.errors import FlowlabError
-from flowlab.recordings.camera_numbers import called_poses, camera_numbers
-from flowlab.recordings.folder_files import FoundFile, files_below, no_files_below
-from flowlab.recordings.foreign import foreign_format
-from flowlab.recordings.metadata import FILE_NAME, Metadata
-from flowlab.recordings.unused_files import by_folder, robot_numbers, some_of
+from flowlab.recordings.file_contents import Contents, array_contents, file_contents
+from flowlab.recordings.folder_files import files_below, no_files_below
+from flowlab.recordings.harmless_files import why_harmless
+from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.unused_files import by_folder, is_ignored, matches, quoted, some_of
+from flowlab.recordings.unused_meaning import Unused, ask
 from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import cut
-from flowlab.untrusted import read_text
+from flowlab.text import cut, natural_key, shown
 
 if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
 
-_NUMBERS = (".npy", ".csv", ".txt", ".tsv", ".json", ".log")
-_MOST_READ = 4 << 20
-"""Larger files of numbers are told by their names alone [bytes]."""
 _MANY = 3
-"""So many files of poses in a folder are one for each picture."""
+"""So many files of one kind in a folder are one question."""
+_MANY_BESIDE = 8
+"""So many beside the folders are one, too."""
+_LOOKED_AT = 8
+"""So many of them are read."""
+_STATED = "not used, as 'ignore' says"
 
 
 def find_left_out(source: "ParsedRecording") -> Iterator[Check]:
-    """What of a recording's folder is not used, and why."""
-    if not source.path.is_dir():
-        return  # what lies beside a file belongs to other recordings
-    used = _used(source)
-    if used is None:
+    """What of a recording is not used, and why; a refusal of what ``ignore`` says and cannot be."""
+    if source.path.is_dir() and source.streams.used is None:
         says = f"the reader '{source.reader.name}' does not say which files it uses"
         yield Check("left out", Verdict.ASSUMED, says)
         return
-    unused = [f for f in files_below(source.path) if not _is_used(f.name, used)]
-    asked, unused = _pose_folders(source, unused)
-    for file in list(unused):
-        if (check := _asked(source, file)) is not None:
-            asked.append(check)
-            unused.remove(file)
-    yield from asked
-    groups: dict[str, list[str]] = {}
-    for file in unused:
-        groups.setdefault(_reason(file), []).append(file.name)
-    for name, why in no_files_below(source.path):
-        groups.setdefault(why, []).append(name)
-    says = "; ".join(f"{some_of(by_folder(names))} ({why})" for why, names in groups.items())
-    yield Check("left out", Verdict.OK, says or "every file is used")
+    used, unused = _files(source)
+    odd = dict(no_files_below(source.path)) if source.path.is_dir() else {}
+    yield from _check_ignore(source, used, [*unused, *odd, *source.streams.unread])
+    reasons: dict[str, list[str]] = {}
+    questions, ignore = [], source.metadata.ignore
+    rest = []
+    for name, path in unused.items():
+        why = _STATED if is_ignored(name, ignore) else _known(source, name) or why_harmless(name, path)
+        reasons.setdefault(why, []).append(name) if why else rest.append(name)
+    for item in _items(source, {name: unused[name] for name in rest}):
+        check = ask(source, item)
+        questions += [] if check is None else [check]
+        if check is None:
+            reasons.setdefault("says what is used", []).append(item.told)
+    for name, why in odd.items():
+        if is_ignored(name, ignore):
+            reasons.setdefault(_STATED, []).append(name)
+        else:
+            questions.append(_of_odd(name, why))
+    yield from questions
+    yield from _harmless(source, reasons, bool(questions))
+
+
+def _harmless(source: "ParsedRecording", reasons: dict[str, list[str]], asked: bool) -> Iterator[Check]:
+    """The line of what need not be asked about, if it is all or there is any."""
+    says = "; ".join(f"{some_of(by_folder(names))} ({why})" for why, names in reasons.items())
+    what = "file" if source.path.is_dir() else "array"
+    if says:
+        yield Check("left out", Verdict.OK, says)
+    elif not asked and (source.path.is_dir() or source.path.suffix == ".npz"):
+        yield Check("left out", Verdict.OK, f"every {what} is used")
+
+
+def _files(source: "ParsedRecording") -> tuple[set[str], dict[str, Path | None]]:
+    """Names of the files, or of an ``.npz`` file's arrays, that are used; and those that are not, with their paths.
+
+    What lies beside a recording that is one file belongs to others.
+    """
+    known, used = source.metadata, {FILE_NAME, *source.origin.values()}
+    used |= {f for f in (known.times, known.depth_times, known.state, known.state_times, known.action,
+                         known.action_times, known.T_world_cam_file, known.T_world_cam_times) if f}  # fmt: skip
+    used = {PurePosixPath(name).as_posix() for name in (*used, *(source.streams.used or ()))}
+    if not source.path.is_dir():
+        arrays = _arrays(source.path) if source.path.suffix == ".npz" else []
+        return used, {name: None for name in arrays if f"{name}.npy" not in used}
+    found = {f.name: f.path for f in files_below(source.path)}
+    unused: dict[str, Path | None] = {n: p for n, p in found.items() if not _is_used(n, used)}
+    if unused:  # behind links a used file has another name
+        same = {_inode(path) for name, path in found.items() if name not in unused}
+        unused = {name: path for name, path in unused.items() if path is None or _inode(path) not in same}
+    return used, unused
+
+
+def _arrays(path: Path) -> list[str]:
+    with zipfile.ZipFile(path) as archive:
+        return sorted((n.removesuffix(".npy") for n in archive.namelist()), key=natural_key)
+
+
+def _inode(path: Path) -> tuple[int, int]:
+    about = path.stat()
+    return about.st_dev, about.st_ino
 
 
 def _is_used(name: str, used: set[str]) -> bool:
     """Whether a file, or a folder that it is in, is used."""
-    return name in used or any(folder.as_posix() in used for folder in Path(name).parents)
+    return name in used or any(folder.as_posix() in used for folder in PurePosixPath(name).parents)
 
 
-def _used(source: "ParsedRecording") -> set[str] | None:
-    """The files that are used, by their names below the folder; None where that is not known."""
-    known, used = source.metadata, {FILE_NAME}
-    used |= {f for f in (known.times, known.depth_times, known.state, known.state_times, known.action,
-                         known.action_times, known.T_world_cam_file, known.T_world_cam_times) if f}  # fmt: skip
-    return None if source.streams.used is None else used | set(source.streams.used)
+def _known(source: "ParsedRecording", name: str) -> str | None:
+    """Why the layout has a file and does not use it."""
+    return next((why for pattern, why in source.streams.passed_over if matches(name, pattern)), None)
 
 
-def _asked(source: "ParsedRecording", file: FoundFile) -> Check | None:
-    """A doubt about a file that may be the robot's numbers or the camera's poses, with what to write."""
-    name = Path(file.name)
-    if name.suffix.lower() not in _NUMBERS or len(name.parts) > 2:
-        return None
-    for what in ("state", "action"):
-        if robot_numbers(name.stem, what) and not getattr(source.streams, what):
-            says = (
-                f"{cut(file.name)} is not used; if it is the {what}, write '{what}: {cut(file.name)}' into {FILE_NAME}"
-            )
-            return Check(what, Verdict.DOUBTFUL, says)
-    values = _values(file.path)
-    if (asked := _of_rows(source, file, values)) is not None:
-        return asked
-    why = _of_camera(source, file, values)
-    return None if why is None else Check("camera", Verdict.DOUBTFUL, f"{cut(file.name)} is not used; {why}")
-
-
-def _of_rows(source: "ParsedRecording", file: FoundFile, values: np.ndarray | None) -> Check | None:
-    """A doubt about a file with numbers for every picture, which may be the robot's; None where it has none."""
-    steps = {len(source.streams.color), len(source.streams.depth)}
-    if values is None or values.ndim != 2 or len(values) not in steps or called_poses(Path(file.name).stem.lower()):
-        return None
-    rises = values.shape[1] == 1 and len(values) > 1 and (np.diff(values[:, 0]) > 0).all()
-    if source.streams.state or rises:  # as times do, which are compared with those that are used
-        return None
-    name = cut(file.name)
-    says = f"{name} has {values.shape[1]} numbers for every picture and is not used; if it is the state, write"
-    return Check("state", Verdict.DOUBTFUL, f"{says} 'state: {name}' into {FILE_NAME}")
-
-
-def _of_camera(source: "ParsedRecording", file: FoundFile, values: np.ndarray | None) -> str | None:
-    """What is said of a file that may have numbers of the camera; None where it has none."""
-    name, posed = Path(file.name), source.streams.poses is not None
-    says = None if values is None else camera_numbers(name.stem, values, source.metadata, posed)
-    if says is not None or (values is not None and values.shape[-2:] in ((4, 4), (3, 4), (3, 3))):
-        return says
-    if posed or not called_poses(name.stem):
-        return None
-    return (f"if it has poses of a camera that moves, each camera to world, write 'T_world_cam_file: {cut(file.name)}' "
-            f"into {FILE_NAME}, if one of a camera that stands still, that as 'T_world_cam'")  # fmt: skip
-
-
-def _values(path: Path) -> np.ndarray | None:
-    """The numbers of a small file; None where it holds something else."""
-    try:
-        if path.stat().st_size > _MOST_READ:
-            return None
-        if path.suffix.lower() == ".npy":
-            return load_array(path)
-        return np.array([[float(x) for x in re.split(r"[,;\s]+", line.strip())]
-                         for line in read_text(path).splitlines() if line.strip()])  # fmt: skip
-    except (FlowlabError, ValueError, OSError):
-        return None
-
-
-def _pose_folders(source: "ParsedRecording", files: list[FoundFile]) -> tuple[list[Check], list[FoundFile]]:
-    """A doubt for each folder with a pose for every picture; and the other files."""
-    folders: dict[str, list[FoundFile]] = {}
-    for file in files:
-        if Path(file.name).suffix.lower() in _NUMBERS:
-            folders.setdefault(Path(file.name).parent.as_posix(), []).append(file)
-    asked, left = [], list(files)
-    for folder, found in folders.items():
-        if folder == "." or len(found) < _MANY or source.streams.poses is not None:
+def _check_ignore(source: "ParsedRecording", used: set[str], unused: Iterable[str]) -> Iterator[Check]:
+    """Refusals of patterns that match nothing, or what is used; a calibration file serves other recordings, too."""
+    names = list(unused)
+    own = source.origin.get("ignore") == (FILE_NAME if source.path.is_dir() else source.path.with_suffix(".yaml").name)
+    for pattern in source.metadata.ignore:
+        taken = sorted(name for name in used if matches(name, pattern) and name != FILE_NAME)
+        if taken:
+            says = f"'ignore' has {shown(pattern)}, which matches {shown(taken[0])}, and that is used; leave it out"
+        elif own and not any(matches(name, pattern) for name in names):
+            left = f"those that are not used are {some_of(by_folder(names))}" if names else "every one is used"
+            says = f"'ignore' has {shown(pattern)}, which matches no file; {left}"
+        else:
             continue
-        values = _values(found[0].path)
-        if values is None or camera_numbers("poses", values, Metadata(), False) is None:
+        yield Check("ignore", Verdict.REFUSED, f"{says}; correct it in {source.write_to}")
+
+
+def _items(source: "ParsedRecording", files: dict[str, Path | None]) -> Iterator[Unused]:
+    """The files one by one, those of one kind in a folder together."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in files:
+        folder, _, last = name.rpartition("/")
+        groups.setdefault((folder, PurePosixPath(last).suffix.lower()), []).append(name)
+    for (folder, _), names in groups.items():
+        paths = [path for name in names if (path := files[name]) is not None]
+        if paths and len(names) >= (_MANY if folder else _MANY_BESIDE):
+            yield Unused(f"{folder or '.'}/", paths[0], len(names), _together(paths))
             continue
-        says = (f"{cut(folder)}/ has {len(found)} files with a rigid transform each, and is not used; if they are the "
-                f"poses of the camera, write them, camera to world, into one file, named as 'T_world_cam_file' in "
-                f"{FILE_NAME}")  # fmt: skip
-        asked.append(Check("camera", Verdict.DOUBTFUL, says))
-        left = [file for file in left if file not in found]
-    return asked, left
+        for name in names:
+            path = files[name]
+            yield Unused(name, path, 1, array_contents(source.path, name) if path is None else file_contents(path))
 
 
-def _reason(file: FoundFile) -> str:
-    return foreign_format(file.path) or "no stream uses it"
+def _together(paths: list[Path]) -> Contents:
+    """What files of one kind hold: the arrays of some of them as one, where they are alike."""
+    some = [paths[k] for k in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).astype(int))]
+    first = file_contents(some[0])
+    if first.values is None:
+        return Contents(first.holds, names=first.names, words=first.words)
+    values = [found for path in some if (found := file_contents(path).values) is not None]
+    alike = len(values) == len(some) and len({v.shape for v in values}) == 1
+    return Contents(f"{first.holds} in each", np.stack(values) if alike else None, first.names)
+
+
+def _of_odd(name: str, why: str) -> Check:
+    """A doubt about what is neither a file nor a folder."""
+    how = "put what it led to in its place" if "link" in why else "take it away"
+    says = f"{cut(name)} is not used: it is {why}; {how}; if it is not to be used, write 'ignore: [{quoted(name)}]'"
+    return Check("left out", Verdict.DOUBTFUL, says)
 
 
 def check_widths_known(source: "ParsedRecording") -> Iterator[Check]:

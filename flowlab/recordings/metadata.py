@@ -119,6 +119,8 @@ class Metadata(FiniteSettings):
     """Serial number of the camera to use, where a recording has several."""
     topics: Topics = Topics()
     """Topics of a ROS bag."""
+    ignore: tuple[str, ...] = ()
+    """Patterns of files that are not to be used: of names below the recording, of arrays, or of keys (``file:key``)."""
 
 
 def load_metadata(path: Path) -> Metadata:

@@ -1,5 +1,6 @@
 """Poses of a camera that moves: read from files, and known at every picture."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from flowlab.recordings.columns import base_and_unit
 from flowlab.recordings.sample_files import check_times, load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.sync import GAP, sampling_rate
-from flowlab.recordings.tables import SampleTable, read_table
+from flowlab.recordings.tables import SampleTable, plain_name, read_table
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 
@@ -33,6 +34,10 @@ _NAMES = {
     "rotationw": "qw",
 }  # fmt: skip
 """What columns are called, by their letters and digits."""
+_WORDS = re.compile(
+    r"(p|pos|position|t|trans|translation|q|quat|quaternion|rot|rotation|orientation)[\W_](?:.*[\W_])?([wxyz])"
+)
+"""Names of columns with frames between the quantity and the axis, as ``p_RS_R_x [m]``."""
 _PARTS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LAYOUTS = (
     "an array (N, 4, 4); or rows of 'timestamp tx ty tz qx qy qz qw' as in TUM's ground truth, of 16 or 12 numbers "
@@ -89,26 +94,35 @@ def read_poses(path: Path) -> tuple[tuple[Float64[np.ndarray, "N"], Timing] | No
 
 def _columns(table: SampleTable) -> tuple[int | None, np.ndarray]:
     """Which column is the time, and the numbers of the poses."""
-    named = {_NAMES.get(base.removeprefix("pose").removeprefix("field")): k
-             for k, base in enumerate(base_and_unit(n)[0] for n in table.names)}  # fmt: skip
+    parts = [_part(name) for name in table.names]
+    named = {part: k for k, part in enumerate(parts)}
     width = table.values.shape[1]
-    if all(part in named for part in _PARTS):
+    if all(parts.count(part) == 1 for part in _PARTS):
         rest = [k for k in range(width) if k not in [named[p] for p in _PARTS]]
         return (rest[0] if rest else None), table.values[:, [named[p] for p in _PARTS]]
     if width == 4 and len(table.values) % 4 == 0:
         return None, table.values.reshape(-1, 16)
     if width in (12, 16):
         return None, table.values
-    if width in (8, 13, 17) and not (width == 8 and table.names and not _is_tum(table)):
+    if width in (13, 17) or (width == 8 and not table.names):
         return 0, table.values[:, 1:]
-    have = f" ({cut(', '.join(table.names))})" if table.names else ""
-    raise DataError(f"{table.path}: has {width} numbers a line{have}, expected poses: {LAYOUTS}")
+    have = ""
+    if table.names:
+        odd = [name for name, part in zip(table.names, parts, strict=True) if part is None]
+        have = f" ({cut(', '.join(table.names))}), of which {cut(', '.join(odd)) or 'none'} is not known"
+    how = f"{LAYOUTS}; columns with names are called {', '.join(_PARTS)}, in meters"
+    raise DataError(f"{table.path}: has {width} numbers a line{have}, expected poses: {how}")
 
 
-def _is_tum(table: SampleTable) -> bool:
-    """Whether names, of which not all are known, do not contradict TUM's order."""
-    known = [_NAMES.get(base_and_unit(n)[0]) for n in table.names[1:]]
-    return all(found in (None, part) for found, part in zip(known, _PARTS, strict=True))
+def _part(name: str) -> str | None:
+    """Which number of a pose a column is by its name, in meters; None where that is not known."""
+    found = re.fullmatch(r"(.*?)[\s_.]*(?:\[\s*m?\s*\])?\s*", name.strip().lower())
+    base = plain_name(found[1]) if found else plain_name(name)
+    base = base.removeprefix("field").removeprefix("pose")
+    if base in _NAMES:
+        return _NAMES[base]
+    words = _WORDS.fullmatch(found[1] if found else "")
+    return None if words is None else ("t" if words[1][0] in "pt" else "q") + words[2]
 
 
 def check_poses(where: str, values: Float[np.ndarray, "N ..."]) -> Float64[np.ndarray, "N 4 4"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Num
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream
-from flowlab.recordings.columns import base_and_unit, find_columns
+from flowlab.recordings.columns import base_and_unit, file_stem, find_columns
 from flowlab.recordings.stamps import Timing, rough_seconds
 from flowlab.recordings.tables import read_table
 
@@ -45,9 +45,13 @@ def load_samples(
     """Rows of numbers: with times, or numbers of frames, of their own (a file, or a column), else one per picture."""
     numbered = color.timing.names and color.timing.integers and fps is not None
     rough_s = rough_seconds(color.time_s, color.timing, fps)
-    found = find_columns(read_table(path), name, columns, rough_s, bool(times), numbered)
+    table = read_table(path)
+    pictures = {file_stem(n): t for n, t in zip(color.names, color.time_s.tolist(), strict=True)} if table.text else {}
+    found = find_columns(table, name, columns, rough_s, bool(times), numbered, pictures)
     own = None if found.time is None else check_times(path, found.time, not (found.time % 1).any(), found.unit_known)
-    if own is not None and found.are_frames:
+    if own is not None and found.are_stamps:
+        own = own[0], color.timing
+    elif own is not None and found.are_frames:
         own = own[0], replace(own[1], names=True)
     if times is not None:
         own = load_times(times)
@@ -61,7 +65,10 @@ def load_samples(
     rows = to_float32(found.values)
     if not np.isfinite(rows).all():
         row = int(np.argmax(~np.isfinite(rows).all(1)))
-        raise DataError(f"{path}: row {row + 1} holds a value that is not finite, or too large for float32")
+        raise DataError(
+            f"{path}: row {row + 1} holds a value that is not finite, or too large for float32; take such rows out, "
+            f"and give the others times, as with '{name}_times'"
+        )
     return SampleStream(name, where, rows, timing, columns=found.names)
 
 

@@ -1,7 +1,8 @@
 """Tables of numbers in text files, as robots, loggers and spreadsheets write them; columns are told by their names."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from flowlab.recordings.cells import POINT, find_splitter, is_grouped, is_number
 from flowlab.text import cut, shown
 from flowlab.untrusted import read_text
 
+_NO_TABLES = {".json", ".jsonl", ".yaml", ".yml", ".npz", ".mat", ".pkl", ".pickle", ".xlsx", ".h5", ".hdf5"}
 _COMMENT = re.compile(r"\s*(#|%|//)")
 
 
@@ -29,6 +31,8 @@ class SampleTable:
     """Columns that hold text, as a frame's name."""
     integers: bool = False
     """Whether all numbers are written without a fraction."""
+    words: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    """The cells of the columns that hold text."""
 
     def column(self, name: str) -> int:
         """The place of a column. Raises :class:`DataError` with the names there are."""
@@ -42,6 +46,8 @@ class SampleTable:
 
 def read_table(path: Path) -> SampleTable:
     """The table of a text file or a numpy array. Raises :class:`DataError` where it is none."""
+    if path.suffix.lower() in _NO_TABLES:
+        raise DataError(f"{path}: is no table; write its numbers as .npy, or as text with a row a line")
     if path.suffix.lower() != ".npy":
         return parse_table(path, read_text(path))
     values = load_array(path)
@@ -69,10 +75,10 @@ def parse_table(path: Path, text: str) -> SampleTable:
         names[:1] = [f"%{names[0]}"] if names and lines[first - 1][1].startswith("%") else names[:1]
     if not cells:
         raise DataError(f"{path}: holds no row of numbers")
-    return _numbers(path, names, cells)
+    return _numbers(path, names, cells, dict(rows))
 
 
-def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -> SampleTable:
+def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]], lines: Mapping[int, str]) -> SampleTable:
     """A table of cells; a column that never holds a number is one of text where it has a name."""
     width = len(names) or len(cells[0][1])
     text = {k for k in range(width if names else 0) if not any(len(c) > k and is_number(c[k]) for _, c in cells)}
@@ -80,15 +86,17 @@ def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]]) -
     _check_grouped(path, cells, text)
     for n, row in cells:
         if len(row) != width or not all(is_number(x) for k, x in enumerate(row) if k not in text):
-            raise DataError(f"{path}: line {n} {_not_numbers(names, width, row)}")
+            raise DataError(f"{path}: line {n} {_not_numbers(names, width, row, lines[n])}")
         rows.append([np.nan if k in text else float(x) for k, x in enumerate(row)])
     integers = all(x.lstrip("+-").isdecimal() for _, row in cells for x in row)
-    return SampleTable(path, tuple(n.strip() for n in names), np.array(rows, np.float64), frozenset(text), integers)
+    words = {k: tuple(row[k].strip() for _, row in cells) for k in text}
+    called = tuple(n.strip() for n in names)
+    return SampleTable(path, called, np.array(rows, np.float64), frozenset(text), integers, words)
 
 
-def _not_numbers(names: list[str], width: int, row: list[str]) -> str:
+def _not_numbers(names: list[str], width: int, row: list[str], line: str) -> str:
     """What is said of a line that is no row of a table, cell by cell as it was cut."""
-    cells = shown(" ".join(row))
+    cells = shown(line)
     if len(row) == width:
         return f"is not {width} numbers: {cells}"
     says = f"has {len(row)} cells, expected {width}, {'as many as names' if names else 'as in the first'}: {cells}"

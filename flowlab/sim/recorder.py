@@ -55,7 +55,7 @@ class Rollout(Demonstration):
 
     def frame(self, t: int) -> Frame:
         """The picture taken at step ``t``, before action ``t``."""
-        return _seen_by(self.camera, self.renderer.frame(self.poses.at(t)))
+        return _seen_by(self.camera_at(t), self.renderer.frame(self.poses.at(t)))
 
 
 def _seen_by(camera: Camera, frame: Frame) -> Frame:

@@ -10,7 +10,8 @@ from flowlab.records import Entity, Role
 
 _BACKGROUND_BODIES = {"world", "tablelink", "RetainingWall"}
 """Bodies of floor, table and wall, in all 50 tasks (the slabs of pick-out-of-hole belong to the world)."""
-_ROBOT_ROOTS = {"base", "mocap"}
+ROBOT_ROOTS = frozenset({"base", "mocap"})
+"""Bodies that a robot hangs from, in all 50 tasks."""
 _VISIBLE_GROUPS = 3
 """MuJoCo draws groups 0-2 by default; collision shapes are in group 4."""
 
@@ -25,6 +26,8 @@ class Poses:
     site_mat: Float[np.ndarray, "*T S 9"]
     body_pos: Float[np.ndarray, "*T B 3"]
     body_mat: Float[np.ndarray, "*T B 9"]
+    cam_pos: Float[np.ndarray, "*T C 3"]
+    cam_mat: Float[np.ndarray, "*T C 9"]
 
     @classmethod
     def of(cls, data: mujoco.MjData) -> "Poses":
@@ -36,6 +39,8 @@ class Poses:
             data.site_xmat.copy(),
             data.xpos.copy(),
             data.xmat.copy(),
+            data.cam_xpos.copy(),
+            data.cam_xmat.copy(),
         )
 
     @classmethod
@@ -56,12 +61,17 @@ class Scene:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, *, markers: bool = True, hidden_bodies: frozenset[str] = frozenset()
+        self,
+        model: mujoco.MjModel,
+        *,
+        markers: bool = True,
+        hidden_bodies: frozenset[str] = frozenset(),
+        robot_roots: frozenset[str] = ROBOT_ROOTS,
     ) -> None:
         self.model = model
         self.markers = markers
         bodies = [_root_chain(model, b) for b in range(model.nbody)]
-        robot = {b for b, chain in enumerate(bodies) if model.body(chain[-1]).name in _ROBOT_ROOTS}
+        robot = {b for b, chain in enumerate(bodies) if model.body(chain[-1]).name in robot_roots}
         self.movable = {int(b) for b in np.flatnonzero(model.body_weldid) if b not in robot}
         """Bodies that can move and are not the robot."""
         hidden = [b for b in range(model.nbody) if model.body(b).name in hidden_bodies]

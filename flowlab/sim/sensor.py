@@ -1,6 +1,7 @@
 """What a depth camera makes of a perfect picture: noise, steps, frayed edges and holes, all by a seed."""
 
 import math
+from statistics import NormalDist
 from types import MappingProxyType
 
 import cv2
@@ -33,6 +34,12 @@ class SensorSettings(Settings):
     """Share of single pixels anywhere that give no reading."""
     blotch_sigmas: float = Field(default=3.0, ge=0)
     """Blotches without reading are where smooth unit noise exceeds this: at 3, about 1 pixel in 1000."""
+    fattened_px: int = Field(default=0, ge=0)
+    """Nearer surfaces reach over their edges by so much [px], as matching by windows makes them."""
+    plain_holes: float = Field(default=0.0, ge=0, le=1)
+    """Share of the surface without texture that gives no reading, in patches."""
+    flying_pixels: float = Field(default=0.0, ge=0, le=1)
+    """Share of the pixels at depth edges that read some depth between the two surfaces."""
     max_range_m: float = Field(default=6.0, gt=0, lt=_EMPTY_M)
     """Nothing farther is seen."""
     gain_noise: float = Field(default=0.015, ge=0)
@@ -56,10 +63,35 @@ CLEAN = SensorSettings(
     jpeg_quality=0,
 )
 """Sees perfectly, but not beyond its range."""
-PRESETS = MappingProxyType({"kinect": KINECT, "clean": CLEAN})
+STEREO = SensorSettings(
+    axial_noise=0.003,
+    axial_correlation_px=2.5,
+    inverse_depth_step=1 / 600,
+    fattened_px=2,
+    plain_holes=0.3,
+    edge_holes=0.1,
+    max_range_m=4.0,
+)
+"""A stereo camera as the D435: noise with z² that neighbors share, fattened edges, holes on plain surfaces."""
+TOF = SensorSettings(
+    axial_noise=0.001,
+    axial_correlation_px=0.0,
+    inverse_depth_step=0,
+    edge_smear_px=0,
+    edge_holes=0.2,
+    flying_pixels=0.5,
+    max_range_m=5.0,
+)
+"""A time-of-flight camera as the Azure Kinect: little noise, flying pixels at edges."""
+PRESETS = MappingProxyType({"kinect": KINECT, "stereo": STEREO, "tof": TOF, "clean": CLEAN})
 
 _SMEAR_CORRELATION_PX = 1.2
 _BLOTCH_CORRELATION_PX = 2.0
+_PATCH_CORRELATION_PX = 6.0
+_MATCHED_PX = 9
+"""Side of the window in which a stereo camera looks for texture."""
+_PLAIN_DEVIATION = 2.0
+"""Brightness within a window that differs by less, of 255, is none that can be matched."""
 _SAME_SURFACE_M = 0.02
 """Where a smeared reading differs by less, there is no edge, and the pixel keeps its own depth."""
 _EDGE_SHARE = 0.03
@@ -73,17 +105,28 @@ class Sensor:
         self.settings = settings
         self._rng = np.random.default_rng(seed)
 
-    def depth(self, z: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-        """What it reads [m] where the true z-depth is ``z`` [m]; 0 where there is nothing, in and out."""
+    def depth(
+        self, z: Float32[np.ndarray, "H W"], rgb: UInt8[np.ndarray, "H W 3"] | None = None
+    ) -> Float32[np.ndarray, "H W"]:
+        """What it reads [m] where the true z-depth is ``z`` [m]; 0 where there is nothing, in and out.
+
+        The color picture says where there is no texture to match, for a sensor with ``plain_holes``.
+        """
         s = self.settings
         true = np.where(z > 0, z, np.float32(_EMPTY_M)).astype(np.float32)
         read = self._smeared(true) if s.edge_smear_px else true.copy()
+        if s.fattened_px:
+            read = cv2.erode(read, np.ones((1, 2 * s.fattened_px + 1), np.uint8))  # windows slide along rows
+        if s.flying_pixels:
+            read = self._flying(true, read)
         if s.axial_noise:
             read += s.axial_noise * read**2 * self._smooth_noise(read.shape, s.axial_correlation_px)
         if s.inverse_depth_step:
             steps = np.round(1 / (np.maximum(read, 0.05) * s.inverse_depth_step))
             read = 1 / np.maximum(steps * s.inverse_depth_step, 1 / _EMPTY_M)
         unseen = (true > s.max_range_m) | (read > s.max_range_m) | self._holes(true)
+        if s.plain_holes and rgb is not None:
+            unseen |= self._plain_holes(rgb)
         return np.where(unseen, 0, read).astype(np.float32)
 
     def rgb(self, picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
@@ -107,6 +150,22 @@ class Sensor:
         v, u = np.mgrid[:height, :width].astype(np.float32)
         shifted = cv2.remap(true, u + du, v + dv, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return np.where(np.abs(shifted - true) < _SAME_SURFACE_M, true, shifted).astype(np.float32)
+
+    def _flying(self, true: Float32[np.ndarray, "H W"], read: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+        """Pixels that light of two surfaces reaches read something between them."""
+        near, far = cv2.erode(true, np.ones((3, 3), np.uint8)), cv2.dilate(true, np.ones((3, 3), np.uint8))
+        mixed = (far - near > _EDGE_SHARE * true) & (far < _EMPTY_M)
+        mixed &= self._rng.random(true.shape) < self.settings.flying_pixels
+        between = near + (far - near) * self._rng.random(true.shape, np.float32)
+        return np.where(mixed, between, read).astype(np.float32)
+
+    def _plain_holes(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Bool[np.ndarray, "H W"]:
+        """Patches without reading where brightness hardly differs around a pixel."""
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        size = (_MATCHED_PX, _MATCHED_PX)
+        variance = cv2.blur(gray**2, size) - cv2.blur(gray, size) ** 2
+        patches = self._smooth_noise(gray.shape, _PATCH_CORRELATION_PX)
+        return (variance < _PLAIN_DEVIATION**2) & (patches > NormalDist().inv_cdf(1 - self.settings.plain_holes))
 
     def _holes(self, true: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
         """Where there is no reading: at edges, here and there, and in blotches."""

@@ -96,7 +96,7 @@ def test_tasks_are_simulated_once(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert [p.name for p in (tmp_path / "recordings").iterdir()] == ["reach-0"]
     assert "reach-0: recorded" in capsys.readouterr().err
     values = json.loads((tmp_path / "grade.json").read_text())
-    assert values["simulated"]["sensor"]["axial_noise"] == 0
+    assert values["simulated"]["tasks"]["sensor"]["axial_noise"] == 0
     assert values["trackers"][0]["mean"]["moving"]["n"] > 100
     run(*SMALL, "--tasks", "reach", "--sensor", "clean", "--out", tmp_path)
     assert "there already" in capsys.readouterr().err
@@ -105,10 +105,26 @@ def test_tasks_are_simulated_once(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "not graded, because" in capsys.readouterr().out, "noise costs queries"
 
 
+def test_scenes_are_filmed_and_told_by_family(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        run(*SMALL, "--scenes", "thin,plain", "--seed", "7", "--out", tmp_path)
+    except MissingLibraryError as error:
+        pytest.skip(str(error))
+    assert {p.name for p in (tmp_path / "recordings").iterdir()} == {"thin-7", "plain-7"}
+    out = capsys.readouterr().out
+    assert "by family of scenes, or task" in out
+    assert "%" in out, "how often labels are confidently wrong"
+    (tracker,) = json.loads((tmp_path / "grade.json").read_text())["trackers"]
+    assert set(tracker["scenes"]) == {"thin", "plain"}
+    assert 0 <= tracker["scenes"]["thin"]["confidently_wrong"] <= 1
+    assert {row["scene"] for row in tracker["recordings"]} == {"thin", "plain"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "expected"),
     [
-        ((), UsageError, "nothing to grade; give folders .* or --tasks hammer,door-open"),
+        ((*SMALL, "--scenes", "tabeltop"), UsageError, "did you mean tabletop"),
+        ((), UsageError, "nothing to grade; give folders .* or --tasks hammer,push"),
         ((*SMALL, "--tasks", "reach, hamer"), UsageError, "did you mean hammer"),
         (
             ("--tasks", "hammer", "--tracker", "rigid-body"),

@@ -15,13 +15,9 @@ from flowlab.geometry.camera import Camera
 from flowlab.grading import grade as grading
 from flowlab.grading import ground_truth
 from flowlab.grading.grade import grade_recording, grade_tracker, read_clip
+from flowlab.grading.graded_recording import UNUSABLE_M, QueryMix
 from flowlab.grading.ground_truth import MADE_WITH, GroundTruth, unusable_queries
-from flowlab.grading.simulate import (
-    UNUSABLE_M,
-    QueryMix,
-    SimulatedRecording,
-    simulate_recording,
-)
+from flowlab.grading.simulate import SimulatedRecording, simulate_recording
 from flowlab.perception.observer import Box, ObserverSettings
 from flowlab.pipeline.stages.simulation import ExpertStage
 from flowlab.recordings.writing import write_rgbd_recording

@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 from thoroughness import examples
 
 from flowlab.geometry.camera import Camera
-from flowlab.grading.calibration import SIGMA_EDGES_MM, calibrate, rank_correlation
+from flowlab.grading.calibration import SIGMA_EDGES_MM, calibrate, confidently_wrong, rank_correlation
 from flowlab.grading.ground_truth import GroundTruth
 from flowlab.grading.metrics import CURVE_MM, EstimatedTracks, TrackErrors, TrackMetrics, average, measure
 from flowlab.grading.tapvid import MetricSettings
@@ -316,3 +316,11 @@ def test_json_has_every_figure() -> None:
     assert set(values) == set(TrackMetrics.__slots__)
     assert set(values["object"]) == set(TrackErrors.__slots__)
     assert len(values["calibration"]["true_mm"]) == len(SIGMA_EDGES_MM) - 1
+
+
+def test_confidently_wrong_is_far_off_without_saying_so() -> None:
+    error = np.array([[0.03, 0.03, 0.019, np.nan, 0.03, 0.5]])
+    sigma = np.array([[0.007, 0.008, 0.001, 0.001, 0.001, 0.13]])
+    seen = np.array([[True, True, True, True, False, True]])
+    assert confidently_wrong(error, sigma, seen) == 1 / 5
+    assert np.isnan(confidently_wrong(error, sigma, np.zeros_like(seen)))

@@ -352,7 +352,7 @@ def test_recordings_whose_numbers_are_called_otherwise_are_rejected(recipe: Reci
     folder = tmp_path / "slide"
     for name, columns in (("1", "a,b"), ("2", "b,a"), ("3", "a,b")):
         record(folder / name)
-        lines = [f"{t}.5,{t + 1}" for t in range(20)]
+        lines = [f"{t}.5,{2 * t + 1}" for t in range(20)]
         (folder / name / "state.csv").write_text("\n".join([columns, *lines]))
         about = yaml.safe_load((folder / name / "recording.yaml").read_text())
         (folder / name / "recording.yaml").write_text(yaml.safe_dump({**about, "state": "state.csv"}))

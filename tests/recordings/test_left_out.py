@@ -19,7 +19,11 @@ def checks(capsys: Capture, path: Path) -> dict[tuple[str, str], str]:
     """What the dry run says of a recording, by what was looked at and the verdict."""
     _, out, _ = call_cli(capsys, "track-real", path, "--dry-run", "--json")
     (facts,) = json.loads(out)["recordings"]
-    return {(c["about"], c["verdict"]): c["says"] for c in facts["checks"]}
+    said: dict[tuple[str, str], str] = {}
+    for c in facts["checks"]:
+        key = c["about"], c["verdict"]
+        said[key] = " | ".join([said[key], c["says"]] if key in said else [c["says"]])
+    return said
 
 
 def litter(folder: Path) -> None:
@@ -34,13 +38,14 @@ def litter(folder: Path) -> None:
     np.save(folder / "joints.npy", np.zeros((6, 7)))
 
 
-def assert_litter_is_named(found: dict[tuple[str, str], str], *, state: bool) -> None:
-    says = found["left out", "ok"]
-    for words in ("notes.md", "thumbs/ (5 files)", "(no stream uses it)", "unpack it with 'zstd -d old.mcap.zstd'",
-                  "lost.png (a link that leads nowhere)", "pipe (no regular file)"):  # fmt: skip
-        assert words in says
-    assert ("joints.npy" in says) == state
-    assert ("joints.npy is not used" in found.get(("state", "doubtful"), "")) != state
+def assert_litter_is_named(told: dict[tuple[str, str], str], *, state: bool) -> None:
+    assert told["left out", "ok"] == "notes.md (documentation); thumbs/ (5 files) (to look at)"
+    doubts = told["left out", "doubtful"]
+    for words in ("unpack it with 'zstd -d old.mcap.zstd'", "lost.png is not used: it is a link that leads nowhere",
+                  "pipe is not used: it is no regular file", "write 'ignore: [pipe]'"):  # fmt: skip
+        assert words in doubts
+    assert ("joints.npy" in doubts) == state
+    assert ("joints.npy is not used" in told.get(("state", "doubtful"), "")) != state
 
 
 def put_rh20t(folder: Path) -> Path:
@@ -91,6 +96,11 @@ def test_arrays_in_a_file_that_nothing_uses_are_named(tmp_path: Path, capsys: Ca
     found = checks(capsys, write_npz(tmp_path / "task_1.npz"))
     assert found["left out", "ok"] == "every array is used"
     found = checks(capsys, write_npz(tmp_path / "task_2.npz", reward=np.zeros(6), point_cloud=np.zeros((6, 9, 3))))
-    assert found["left out", "ok"] == "point_cloud, reward (no stream uses them)"
+    assert found["left out", "ok"] == "reward (counts what was achieved)"
+    assert "point_cloud is not used" in found["left out", "doubtful"]
+    (tmp_path / "task_2.yaml").write_text((tmp_path / "task_2.yaml").read_text() + "ignore: [point_cloud]\n")
+    found = checks(capsys, tmp_path / "task_2.npz")
+    assert "point_cloud (not used, as 'ignore' says)" in found["left out", "ok"]
+    assert ("left out", "doubtful") not in found
     found = checks(capsys, write_npz(tmp_path / "task_3.npz", agent_pos=None, joint_positions=np.zeros((6, 7))))
-    assert "the state must be called so" in found["left out", "doubtful"]
+    assert "joint_positions is not used" in found["left out", "doubtful"]

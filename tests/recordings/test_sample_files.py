@@ -48,7 +48,7 @@ def test_times_may_be_in_a_file_of_their_own(tmp_path: Path) -> None:
     [
         ("s.csv", "1,2\n3,4\n", r"has 2 rows for 3 color pictures; .* 'state_times: state_times\.txt'"),
         ("s.csv", "1,2\n3\n5,6\n", "line 2 has 1 cells, expected 2, as in the first: '3'"),
-        ("s.csv", "1,2\n3,x\n5,6\n", "line 2 is not 2 numbers: '3 x'"),
+        ("s.csv", "1,2\n3,x\n5,6\n", "line 2 is not 2 numbers: '3,x'"),
         ("s.csv", "1,2\n3,nan\n5,6\n", "row 2 holds a value that is not finite"),
         ("s.csv", "time,x\n0,1\nnan,2\n1,3\n", r"entry 2 \(nan\) is no time"),
         ("s.csv", "# empty\n", "holds no row"),

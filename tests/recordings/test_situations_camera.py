@@ -15,6 +15,7 @@ from test_situations_meaning import Capture, looked_at
 from flowlab.recordings.depth_unit_check import likely_unit
 from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_camera_info import rectified
+from flowlab.recordings.readers.ros_topics import of_two_cameras
 from flowlab.recordings.readers.tum import TUMReader
 
 BENT = [0.3, -0.1, 0.0, 0.0, 0.0]
@@ -45,7 +46,7 @@ OPEN3D = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": K.T.ravel().toli
             "5 coefficients",
         ),
         ({"distortion": BENT, "model": "double_sphere"}, 3, "intrinsics", "refused", "'double_sphere' is not known"),
-        ({"note": "of Monday"}, 0, "calibration", "ok", "keys that are not read: note"),
+        ({"note": "of Monday"}, 0, "calibration", "doubtful", "not read: note; .*ignore: .*json:note'"),
         ({"skew": 0.5, "note": ""}, 0, "calibration", "doubtful", "not read: note, skew; what skew says"),
         ({"extrinsic": [1]}, 0, "calibration", "doubtful", "what extrinsic says"),
     ],
@@ -110,7 +111,7 @@ def test_numbers_of_a_camera_that_nothing_uses_are_asked_about(
     [
         ({f"poses/{t:04d}.txt": POSES[t] for t in range(STEPS)}, "poses/ has 6 files with a rigid transform each"),
         ({f"seq/frame-{t}.pose.txt": POSES[t] for t in range(STEPS)}, "seq/ has 6 files"),
-        ({"groundtruth.txt": np.ones((STEPS, 8))}, "'T_world_cam_file: groundtruth.txt'"),
+        ({"groundtruth.txt": np.tile(np.eye(8)[7], (STEPS, 1))}, "'T_world_cam_file: groundtruth.txt'"),
         ({"transforms.json": {"frames": []}}, "transforms.json is not used"),
         ({f"force/{t:04d}.txt": np.ones((4, 4)) for t in range(STEPS)}, ""),
         ({"tcp.txt": np.ones((STEPS, 16)), "notes.json": {}}, ""),
@@ -246,8 +247,8 @@ def test_only_the_benchmarks_own_names_tell_its_cameras(tmp_path: Path, name: st
         ("depth_ts", 0.1 + np.arange(STEPS), "write 'depth_times: depth_ts.npy'"),
         ("ee_states", np.random.default_rng(0).normal(size=(STEPS, 7)), "write 'state: ee_states.npy'"),
         ("observations", np.random.default_rng(0).normal(size=(STEPS, 3)), "write 'state: observations.npy'"),
-        ("weights", np.ones((STEPS + 9, 3)), ""),
-        ("rising", np.arange(STEPS), ""),
+        ("weights", np.ones((STEPS + 9, 3)), "float64 (15, 3)"),
+        ("rising", np.arange(STEPS), "int64 (6,)"),
     ],
 )
 def test_a_row_for_every_picture_is_asked_about(
@@ -299,3 +300,46 @@ def test_topics_that_are_not_read_are_listed(tmp_path: Path, capsys: Capture) ->
 )
 def test_names_say_whether_pictures_were_rectified(topic: str, straight: bool, verdict: str) -> None:
     assert rectified(topic)[:2] == (straight, verdict)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "two"),
+    [
+        ("/cam1/rgb/image_raw", "/cam2/depth_registered/image", True),
+        ("/robot1/camera/color/image_raw", "/robot2/camera/aligned_depth_to_color/image_raw", True),
+        ("/left_color/image", "/right_depth/image_raw", True),
+        ("/wrist/d405/color/image", "/head/d405/aligned_depth_to_color/image", True),
+        ("/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw", False),
+        ("/camera/rgb/image_rect_color", "/camera/depth_registered/sw_registered/image_rect_raw", False),
+        ("/rgb/image_raw", "/depth_to_rgb/image_raw", False),
+        ("/zed/zed_node/left/image_rect_color", "/zed/zed_node/depth/depth_registered", False),
+        ("/device_0/sensor_1/Color_0/image/data", "/device_0/sensor_2/Depth_0/image/data", False),
+        ("/oak/rgb/image_raw", "/oak/stereo/image_raw", False),
+        ("/rgb_camera/image", "/depth_camera/image", False),
+    ],
+)
+def test_names_of_topics_tell_two_cameras(color: str, depth: str, two: bool) -> None:
+    assert of_two_cameras(color, depth) == two
+
+
+@pytest.mark.parametrize(
+    ("depth", "stated", "verdict"),
+    [("cam1", False, "ok"), ("cam2", False, "doubtful"), ("cam2", True, "assumed")],
+)
+def test_depth_of_another_cameras_namespace_is_doubtful(
+    tmp_path: Path, capsys: Capture, depth: str, stated: bool, verdict: str
+) -> None:
+    """Both say the same frame, and the name of depth that it is registered."""
+
+    def say_all(m: Messages, say: Say) -> None:
+        def renamed(topic: str, *rest: Any) -> None:
+            say(topic.replace("/camera/", f"/{depth}/" if "aligned" in topic else "/cam1/"), *rest)
+
+        say_camera(m, renamed)
+
+    topics = {"color": "/cam1/color/image_raw", "depth": f"/{depth}/aligned_depth_to_color/image_raw"}
+    bag = write_bag(tmp_path / "r.bag", 1, say_all)
+    write_yaml(tmp_path / "r.yaml", topics=topics if stated else None)
+    code, _, checks = looked_at(capsys, bag)
+    assert (code, checks["camera_info"][0]) == (0, verdict), checks["camera_info"]
+    assert ("of two cameras" in checks["camera_info"][1]) == (verdict != "ok")

@@ -118,7 +118,7 @@ def test_a_simple_motion_is_no_clock() -> None:
         ("1,5,2,8\n1,9,3,1\n2,3,3,4\n2,7,3,7\n3,1,4,0\n", "one number, 1.5"),
         ("x;y\n1.200,5;2,5\n1.201,5;2,5\n", r"line 2 has '1\.200,5', with a decimal comma or a sign between thousands"),
         ('x,y\n"0,100","0,250"\n', "line 2 has '0,100', with a decimal comma"),
-        ("x,y,z\n1,2\n", "line 2 has 2 cells, expected 3, as many as names: '1 2'"),
+        ("x,y,z\n1,2\n", "line 2 has 2 cells, expected 3, as many as names: '1,2'"),
         ("date,x\n2024-01-05 12:00:00.1,3\n", ""),
         ("0,1,0,1\n1,0,0,1\n0,0,1,1\n", ""),
         ("100,200,300,400\n150,250,310,410\n", ""),

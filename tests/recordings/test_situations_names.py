@@ -120,8 +120,8 @@ def test_files_that_are_not_used_are_listed_and_asked_about(tmp_path: Path, caps
     (one,) = json.loads(call_cli(capsys, "track-real", folder, *OPTIONS)[1])["recordings"]
     checks = {(c["about"], c["verdict"]): c["says"] for c in one["checks"]}
     assert "write 'state: state.npy' into recording.yaml" in checks["state", "doubtful"]
-    assert "notes.md (no stream uses it)" in checks["left out", "ok"]
-    assert "unpack it with 'zstd -d old.mcap.zstd'" in checks["left out", "ok"]
+    assert checks["left out", "ok"] == "notes.md (documentation)"
+    assert "unpack it with 'zstd -d old.mcap.zstd'" in checks["left out", "doubtful"]
 
 
 def test_links_are_followed_and_unread_formats_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -206,10 +206,11 @@ def test_dates_in_lists_and_tables_are_no_numbers(tmp_path: Path, inspect: Inspe
         ("times.txt", 200.0, "times: times.txt"),
         ("color_ts.npy", 0.2, "times: color_ts.npy"),
         ("depth_timestamps.txt", 0.2, "depth_times: depth_timestamps.txt"),
-        ("timestamps.csv", 0.1, "times: timestamps.csv"),  # with names of columns: it is not read
+        ("timestamps.csv", 0.2, "times: timestamps.csv"),
+        ("timestamps.csv", 0.1, None),
         ("timestamps.txt", 0.1, None),
         ("times.npy", 100.0, None),
-        ("time_of_flight_notes.txt", None, "times"),
+        ("time_of_flight_notes.txt", None, None),
     ],
 )
 def test_times_beside_the_pictures_are_compared(
@@ -229,13 +230,12 @@ def test_times_beside_the_pictures_are_compared(
 
 
 @pytest.mark.parametrize(
-    ("name", "late", "fine"),
-    [("depth_timestamps", 0.2, False), ("state_timestamps", 0.3, False), ("color_timestamps", 0.0, True),
-     ("depth_timestamps", 0.01, True)],
-)  # fmt: skip
+    ("name", "late", "lost"),
+    [("depth_timestamps", 0.2, 2), ("state_times", 0.3, 3), ("color_timestamps", 0.0, 0), ("depth_ts", 0.01, 0)],
+)
 @pytest.mark.parametrize("packed", [True, False])
-def test_times_in_arrays_are_compared(
-    tmp_path: Path, inspect: Inspect, name: str, late: float, fine: bool, packed: bool
+def test_arrays_have_times_of_their_own(
+    tmp_path: Path, inspect: Inspect, name: str, late: float, lost: int, packed: bool
 ) -> None:
     times = np.arange(STEPS) / 10
     color, depth = (np.stack([picture(t)[which] for t in range(STEPS)]) for which in (0, 1))
@@ -250,5 +250,9 @@ def test_times_in_arrays_are_compared(
             np.save(path / f"{array}.npy", values)
     beside = path.with_suffix(".yaml") if packed else path / "recording.yaml"
     write_yaml(beside, intrinsics=INTRINSICS, depth_unit_m=0.001)
-    facts = assert_fine(inspect(path), doubtful=True)
-    assert (not [c for c in facts["checks"] if c["about"] == "times"]) == fine
+    _, facts = inspect(path)
+    assert len(facts["bad_frames"]) == lost, facts["bad_frames"]
+    assert {c["says"] for c in facts["checks"] if c["about"] == "left out"} <= {
+        f"every {'array' if packed else 'file'} is used",
+        f"timestamp{'' if packed else '.npy'} (says what is used)",
+    }

@@ -110,7 +110,7 @@ def test_blotches_are_rare_and_larger_than_pixels() -> None:
 
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_nothing_is_seen_beyond_the_range_or_where_there_is_nothing(name: str) -> None:
-    truth = wall(5.0)
+    truth = wall(0.9 * PRESETS[name].max_range_m)
     truth[:, :100], truth[:, 100:200] = 0, 6.5
     read = Sensor(PRESETS[name], 0).depth(truth)
     assert (read[:, :98] == 0).all()
@@ -170,3 +170,28 @@ def test_settings_refuse_nonsense() -> None:
         SensorSettings(edge_holes=1.5)
     with pytest.raises(ValidationError):
         SensorSettings.model_validate({"edge_hole": 0.1})
+
+
+def test_stereo_fattens_what_is_near_along_rows() -> None:
+    z = box_before_wall()
+    read = Sensor(only(fattened_px=3), 0).depth(z)
+    assert (read[100, 77:243] == 1).all()
+    assert read[100, 76] == 2
+    assert read[59, 100] == 2, "windows slide along rows"
+
+
+def test_stereo_reads_nothing_in_patches_of_what_is_plain() -> None:
+    rgb = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    rgb[:, :160] = np.random.default_rng(0).integers(0, 255, (HEIGHT, 160, 3))
+    shares = [Sensor(only(plain_holes=0.3), seed).depth(wall(1.0), rgb) == 0 for seed in range(12)]
+    holes = np.mean(shares, 0)
+    assert holes[:, :150].max() == 0
+    assert holes[:, 170:].mean() == pytest.approx(0.3, abs=0.06)
+
+
+def test_time_of_flight_reads_between_surfaces_at_their_edges() -> None:
+    z = box_before_wall()
+    read = Sensor(only(flying_pixels=0.5), 0).depth(z)
+    flying = (read > 1.001) & (read < 1.999)
+    assert not flying[~edge_pixels()].any()
+    assert flying[edge_pixels()].mean() == pytest.approx(0.5, abs=0.05)

@@ -1,6 +1,7 @@
 """One episode as arrays, as diffusion policies keep them: an ``.npz`` file, or a folder of ``.npy`` files."""
 
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,17 +11,15 @@ import numpy as np
 from flowlab.array_files import map_array, map_member
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
-from flowlab.recordings.camera_numbers import camera_numbers
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME, Metadata, combine
+from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
-from flowlab.recordings.unused_files import robot_numbers, some_of
-from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import cut, natural_key, shown
+from flowlab.text import cut
 
+_OF_TIMES = ("timestamp", "timestamps", "time", "times", "time_s", "ts", "stamps")
 NAMES = {
     "color": ("color", "rgb", "img", "image", "images", "colors"),
     "depth": ("depth", "depths", "depth_img"),
@@ -45,10 +44,11 @@ NAMES = {
     "ends": ("episode_ends",),
 }
 """What arrays may be called, by what they are."""
-_MOST_TOLD = 4 << 20
-"""Larger arrays are not a camera's [bytes]."""
+TIMED = ("color", "depth", "state", "action")
+NAMES |= {f"{what} time": tuple(f"{name}_{t}" for name in NAMES[what] for t in _OF_TIMES) for what in TIMED}
 POSES = ("T_world_cam", "cam2world", "camera_to_world")
 """Those of poses whose names say that they map the camera to the world."""
+_INVERSE = ("T_cam_world", "world2cam", "world_to_camera")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class ArraysReader:
         assert color is not None
         assert depth is not None
         _check(store, names, color, depth)
-        stamps = _times(store, len(color), given)
+        stamps, depth_stamps = _times(store, len(color), given)
         K = store.load("intrinsics")
         T = None if given.T_world_cam is not None else store.load("pose")
         known: tuple[tuple[str, Metadata], ...] = (
@@ -108,15 +108,21 @@ class ArraysReader:
         elif T is not None:
             known += ((f"{path.name}:{names['pose']}", _pose(path, names["pose"], T)),)
         return Streams(
-            ImageStream(_called(names["color"], len(color)), stamps[0], partial(_color, store, color), stamps[1]),
-            ImageStream(_called(names["depth"], len(depth)), stamps[0], partial(_depth, store, depth), stamps[1]),
+            _pictures(names["color"], partial(_color, store, color), *stamps),
+            _pictures(names["depth"], partial(_depth, store, depth), *depth_stamps),
             state=_samples(store, "state", *stamps),
             action=_samples(store, "action", *stamps),
             known=known,
-            checks=_unused_members(path, names, combine([("", given), *known])[0], poses is not None),
-            used=tuple(f"{name}.npy" for what, name in names.items() if what != "cloud"),
+            used=tuple(f"{name}.npy" for what, name in names.items() if _is_read(what, names)),
             poses=poses,
         )
+
+
+def _is_read(what: str, names: dict[str, str]) -> bool:
+    """Whether an array is used by what it is: times where there is what they are of, one time for all where it is."""
+    if what == "time":
+        return "color time" not in names or "depth time" not in names
+    return what != "cloud" and (not what.endswith(" time") or what.removesuffix(" time") in names)
 
 
 def _find(path: Path) -> dict[str, str]:
@@ -133,7 +139,7 @@ def _present(path: Path) -> set[str]:
 def _check_single(path: Path, used: dict[str, str]) -> None:
     """Refuse several arrays that are called as one thing, unless they are the same."""
     present = _present(path)
-    for what in ("color", "depth", "state", "action", "time", "intrinsics", "pose"):
+    for what in NAMES.keys() - {"cloud", "ends"}:
         several = [name for name in NAMES[what] if name in present]
         if len(several) < 2:
             continue
@@ -154,43 +160,9 @@ def _members(path: Path) -> set[str]:
         return set()
 
 
-def _unused_members(path: Path, names: dict[str, str], known: Metadata, posed: bool) -> tuple[Check, ...]:
-    """The arrays of an ``.npz`` file that no stream uses, by name; those of a folder are files."""
-    if path.is_dir():
-        return ()
-    used = {name for what, name in names.items() if what != "cloud"}
-    unused = sorted(_members(path) - used, key=natural_key)
-    if not unused:
-        return (Check("left out", Verdict.OK, "every array is used"),)
-    wanted = ", ".join(what for what in ("state", "action") if what not in names)
-    hint = f"; one that is the {wanted.replace(', ', ' or the ')} must be called so" if wanted else ""
-    says = f"{some_of(unused)} (no stream uses them{hint})"
-    checks = [Check("left out", Verdict.DOUBTFUL if _of_robots(unused, names) else Verdict.OK, says)]
-    for name in unused:
-        values = _small_member(path, name)
-        told = None if values is None else camera_numbers(name, values, known, posed)
-        checks += [] if told is None else [Check("camera", Verdict.DOUBTFUL, f"{shown(name)} is not used; {told}")]
-    return tuple(checks)
-
-
-def _small_member(path: Path, name: str) -> np.ndarray | None:
-    """An array that nothing uses; None where it is large, or cannot be read, which then does not matter."""
-    try:
-        with zipfile.ZipFile(path) as file:
-            size = file.getinfo(f"{name}.npy").file_size
-        return map_member(path, name) if size <= _MOST_TOLD else None
-    except (DataError, KeyError, OSError, zipfile.BadZipFile):
-        return None
-
-
-def _of_robots(unused: list[str], names: dict[str, str]) -> bool:
-    """Whether some of these look like the state or the action, of which there is none by its usual name."""
-    return any(robot_numbers(name, what) for name in unused for what in ("state", "action") if what not in names)
-
-
-def _called(name: str, count: int) -> tuple[str, ...]:
-    """Names of the pictures of an array."""
-    return tuple(f"{name}[{k}]" for k in range(count))
+def _pictures(name: str, read: Callable[[int], np.ndarray], time_s: np.ndarray, timing: Timing) -> ImageStream:
+    """The pictures of an array."""
+    return ImageStream(tuple(f"{name}[{k}]" for k in range(len(time_s))), time_s, read, timing)
 
 
 def _check(store: _Store, names: dict[str, str], color: np.ndarray, depth: np.ndarray) -> None:
@@ -223,35 +195,55 @@ def _depth(store: _Store, pictures: np.ndarray, index: int) -> np.ndarray:
     return check_depth(np.array(pictures[index]))
 
 
-def _times(store: _Store, steps: int, given: Metadata) -> tuple[np.ndarray, Timing]:
-    """When every step was, and what is known of that."""
-    time_s = store.load("time")
-    if time_s is not None:
-        if time_s.shape != (steps,) or time_s.dtype.kind not in "iuf":
-            found = f"{time_s.dtype} {cut(str(time_s.shape))}"
-            raise DataError(f"{store.path}: '{store.names['time']}' is {found}, expected numbers ({steps},)")
-        stamps, timing = check_times(store.path, np.asarray(time_s), time_s.dtype.kind in "iu")
-        return stamps, replace(timing, source=f"'{store.names['time']}'")
+_Stamps = tuple[np.ndarray, Timing]
+
+
+def _times(store: _Store, steps: int, given: Metadata) -> tuple[_Stamps, _Stamps]:
+    """When every step was, and what is known of that; of color and of depth, which may have times of their own."""
+    every = _stamps(store, "time", steps)
+    color, depth = (_stamps(store, f"{what} time", steps) for what in ("color", "depth"))
+    first = color or every
+    if first is not None:
+        return first, depth or every or first
     if given.fps is None:
         where = FILE_NAME if store.path.is_dir() else store.path.with_suffix(".yaml").name
         raise DataError(f"{store.path}: has no times; write 'fps: 10' (steps per second) into {where}")
-    return np.arange(steps) / given.fps, Timing("steps over fps")
+    counted = np.arange(steps) / given.fps, Timing("steps over fps")
+    if depth is not None:
+        raise DataError(f"{store.path}: '{store.names['depth time']}' has the times of depth, and there are none of "
+                        "color; call those 'color_timestamps' or 'timestamp'")  # fmt: skip
+    return counted, counted
+
+
+def _stamps(store: _Store, what: str, steps: int | None) -> _Stamps | None:
+    """An array of times, and what is known of them; None where there is none."""
+    time_s = store.load(what)
+    if time_s is None:
+        return None
+    count = len(time_s) if steps is None and time_s.ndim else steps
+    if time_s.shape != (count,) or time_s.dtype.kind not in "iuf":
+        found = f"{time_s.dtype} {cut(str(time_s.shape))}"
+        raise DataError(f"{store.path}: '{store.names[what]}' is {found}, expected numbers ({count},)")
+    stamps, timing = check_times(store.path, np.asarray(time_s), time_s.dtype.kind in "iu")
+    return stamps, replace(timing, source=f"'{store.names[what]}'")
 
 
 def _samples(store: _Store, what: str, time_s: np.ndarray, timing: Timing) -> tuple[SampleStream, ...]:
-    """The rows of state or actions; nothing where there is no such array."""
+    """The rows of state or actions, at their own times where they have some; nothing where there is no such array."""
     values = store.load(what)
     if values is None:
         return ()
-    if values.ndim != 2 or len(values) != len(time_s) or values.dtype.kind not in "fiu":
+    own = _stamps(store, f"{what} time", None)
+    stamps, known = own or (time_s, timing)
+    if values.ndim != 2 or len(values) != len(stamps) or values.dtype.kind not in "fiu":
         raise DataError(
             f"{store.path}: '{store.names[what]}' is {values.dtype} {values.shape}, "
-            f"expected numbers ({len(time_s)}, width)"
+            f"expected numbers ({len(stamps)}, width)"
         )
     rows = to_float32(values)
     if not np.isfinite(rows).all():
         raise DataError(f"{store.path}: '{store.names[what]}' holds values that are not finite")
-    return (SampleStream(what, time_s, rows, timing),)
+    return (SampleStream(what, stamps, rows, known),)
 
 
 def _known(path: Path, K: np.ndarray) -> Metadata:
@@ -275,12 +267,20 @@ def _poses(store: _Store, T: np.ndarray, time_s: np.ndarray, timing: Timing) -> 
     """The poses of a camera that moves."""
     name = store.names["pose"]
     if name not in POSES:
-        raise DataError(f"{store.path}: '{name}' does not say whether it maps camera to world or world to camera; call it "  # noqa: E501
-                        "'T_world_cam' if it maps camera to world, else invert it")  # fmt: skip
+        raise DataError(
+            f"{store.path}: '{name}' {_direction(name)}; camera to world is called 'T_world_cam', else invert it"
+        )
     found = check_poses(f"{store.path}: '{name}'", T)
     if len(found) != len(time_s):
         raise DataError(f"{store.path}: '{name}' has {len(found)} poses for {len(time_s)} steps, expected one for each")
     return pose_stream(f"'{name}'", time_s, found, timing)
+
+
+def _direction(name: str) -> str:
+    """What is said of poses that are not called as those of the camera in the world."""
+    if name in _INVERSE:
+        return "maps the world to the camera, by its name"
+    return "does not say whether it maps camera to world or world to camera"
 
 
 def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
@@ -290,5 +290,5 @@ def _pose(path: Path, name: str, T: np.ndarray) -> Metadata:
         raise DataError(f"{path}: '{name}' is {T.dtype} {cut(str(T.shape))}, expected numbers (4, 4); {advice}")
     every = T.reshape(-1, 4, 4).astype(float)
     if name not in POSES:
-        raise DataError(f"{path}: '{name}' does not say whether it maps camera to world or world to camera; {advice}")
+        raise DataError(f"{path}: '{name}' {_direction(name)}; {advice}")
     return Metadata(T_world_cam=every[0].tolist())

@@ -1,7 +1,7 @@
 """What Open3D's recorder and bag reader write beside pictures: ``intrinsic.json``; and what others add to it."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,8 @@ import numpy as np
 from flowlab.errors import DataError, first_line
 from flowlab.recordings.intrinsics import Intrinsics, distortion_of, is_transposed
 from flowlab.recordings.metadata import FILE_NAME, Metadata
-from flowlab.recordings.verdicts import Check, Verdict
+from flowlab.recordings.unused_files import unread_keys
+from flowlab.recordings.verdicts import Check
 from flowlab.text import cut, shown
 from flowlab.untrusted import read_json
 
@@ -30,11 +31,13 @@ _GEOMETRY = re.compile(
 """What keys have in their names that may matter to where things are."""
 
 
-def open3d_calibration(path: Path) -> tuple[tuple[tuple[str, Metadata], ...], tuple[Check, ...]]:
-    """What the file tells of a recording's camera, and what is to be said of keys that are not Open3D's."""
+def open3d_calibration(
+    path: Path, ignore: Sequence[str]
+) -> tuple[tuple[tuple[str, Metadata], ...], tuple[Check, ...], tuple[str, ...]]:
+    """What the file tells of a recording's camera, what is to be said of keys that are not read, and these."""
     name = next((name for name in FILES if (path / name).is_file()), None)
     if name is None:
-        return (), ()
+        return (), (), ()
     file = path / name
     values = read_json(file, f"give 'intrinsics' in {FILE_NAME}")
     try:
@@ -50,7 +53,10 @@ def open3d_calibration(path: Path) -> tuple[tuple[tuple[str, Metadata], ...], tu
         raise DataError(
             f"{file}: is not what Open3D writes ({first_line(error)}); give 'intrinsics' in {FILE_NAME}"
         ) from error
-    return known, tuple(_unknown(name, set(map(str, values)) - _KNOWN - used))
+    unread = {*map(str, values)} - _KNOWN - used
+    matter = sorted(key for key in unread if _GEOMETRY.search(key.lower()))
+    advice = f"; what {cut(', '.join(matter))} says of the camera goes into {FILE_NAME}" if matter else ""
+    return known, tuple(unread_keys(name, unread, advice, ignore)), tuple(f"{name}:{key}" for key in sorted(unread))
 
 
 def _lens(values: Mapping[str, Any]) -> tuple[dict[str, Any], set[str]]:
@@ -70,14 +76,3 @@ def _lens(values: Mapping[str, Any]) -> tuple[dict[str, Any], set[str]]:
     coefficients = np.array(given, float).ravel().tolist()
     model = values[models[0]] if models else None
     return distortion_of(model, coefficients), {str(key) for key in (*lists, *models, *single.values())}
-
-
-def _unknown(name: str, keys: set[str]) -> list[Check]:
-    """What is said of keys that nothing reads."""
-    if not keys:
-        return []
-    matter = sorted(key for key in keys if _GEOMETRY.search(key.lower()))
-    says = f"{name} has keys that are not read: {cut(', '.join(sorted(keys)))}"
-    if matter:
-        says += f"; what {cut(', '.join(matter))} says of the camera goes into {FILE_NAME}"
-    return [Check("calibration", Verdict.DOUBTFUL if matter else Verdict.OK, says)]

@@ -39,16 +39,17 @@ class PlainReader:
 
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams; their times are the numbers in the names over ``fps``, or from files."""
-        known, checks = open3d_calibration(path)
+        known, checks, unread = open3d_calibration(path, given.ignore)
         fps = given.fps or next((m.fps for _, m in known if m.fps), None)
-        return replace(read_folder(path, given, fps, known), checks=checks)
+        return replace(read_folder(path, given, fps, known), checks=checks, unread=unread)
 
 
 def read_folder(path: Path, given: Metadata, fps: float | None, known: tuple[tuple[str, Metadata], ...]) -> Streams:
     """The streams of a folder with two folders of pictures."""
     color = _list(path, "color", given.color, COLOR_SUFFIXES)
     depth = _list(path, "depth", given.depth, DEPTH_SUFFIXES)
-    used = (TRUE_TRACKS, *FILES, *(f.relative_to(path).as_posix() for f in (*color, *depth)))
+    read = [name for name in FILES if (path / name).is_file()][:1]
+    used = (TRUE_TRACKS, *read, *(f.relative_to(path).as_posix() for f in (*color, *depth)))
     if given.times is not None:
         color_stamps = _listed(path / given.times, color)
         own = given.depth_times is not None

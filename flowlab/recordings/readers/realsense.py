@@ -35,7 +35,7 @@ class RealSenseReader:
         if not is_sdk_bag(path):
             raise DataError(f"{path}: is no bag of the RealSense SDK; a general ROS bag is read by the reader 'ros'")
         folder = extracted(path)
-        known, told = open3d_calibration(folder)
+        known, told, unread = open3d_calibration(folder, given.ignore)
         fps = given.fps or next((m.fps for _, m in known if m.fps), None)
         if fps is None:
             raise DataError(
@@ -47,6 +47,7 @@ class RealSenseReader:
         return Streams(
             streams.color, streams.depth, known=known, registered=True,
             checks=(Check("frame rate", Verdict.ASSUMED, "times are frame numbers over the frame rate"), *told, *lost),
+            unread=unread,
         )  # fmt: skip
 
 

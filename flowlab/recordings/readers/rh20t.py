@@ -22,6 +22,7 @@ from flowlab.recordings.metadata import FILE_NAME, Metadata, check_rigid
 from flowlab.recordings.readers.safe_pickle import pickled_numbers
 from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.stamps import Timing
+from flowlab.recordings.unused_files import unread_keys
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut, is_plain_name, shown
 from flowlab.untrusted import read_json, read_text
@@ -31,6 +32,12 @@ _LATEST_MS = 1e15
 """In the year 33658."""
 _LENS = re.compile(r"dist|lens|coef")
 """What files of distortion are called."""
+_KNOWN = {"finish_time", "rating", "calib", "calib_quality", "task", "task_id", "user", "user_id", "scene", "scene_id"}
+"""Keys of metadata.json that are read, or tell nothing of where and when things were."""
+_OTHERS = (
+    "gripper", "joint", "tcp_base", "force_torque", "force_torque_base", "high_freq_data", "transformed", "audio*",
+)  # fmt: skip
+"""Folders of RH20T that are not used where there is state."""
 STATE = ("tcp", "gripper_command")
 """Folders of robot state, in the order of its columns."""
 
@@ -50,7 +57,9 @@ class RH20TReader:
         """The streams of one camera, color up to the ``finish_time`` of ``metadata.json``; names are milliseconds."""
         folder = path if _has_pictures(path) else _choose(path, given.camera)
         episode, serial = folder.parent, folder.name.removeprefix("cam_")
-        about = _about(episode / "metadata.json")
+        about, keys = _about(episode / "metadata.json")
+        told = unread_keys("metadata.json", keys, "", given.ignore)
+        unread = tuple(f"metadata.json:{key}" for key in keys)
         stop_ms = float(about.get("finish_time", np.inf))
         color = _timed(folder / "color", COLOR_SUFFIXES, stop_ms)
         depth = _timed(folder / "depth", (".png",))
@@ -65,18 +74,30 @@ class RH20TReader:
             state=_state([folder, episode]),
             known=(*calibration, (custom, known)),
             registered=True,
-            checks=(*checks, *_after_finish(folder, len(color[0]))),
-            used=_used(path, folder),
+            checks=(*checks, *told, *_after_finish(folder, len(color[0]))),
+            used=_used(path, folder, color[0], depth[0]),
+            passed_over=_passed_over(path, folder, np.isfinite(stop_ms)),
+            unread=unread,
         )
 
 
-def _used(path: Path, folder: Path) -> tuple[str, ...]:
-    """The files and folders of an episode that are looked at, below the recording."""
-    of_episode = [folder.parent / name for name in ("metadata.json", "timestamp.txt", *STATE)]
-    of_camera = [folder / name for name in ("color", "depth", *STATE)]
-    taken = [f for f in (*of_camera, *of_episode) if f.is_relative_to(path)]
-    twice = [f for f in taken if f.parent == folder.parent and f.name in STATE and (folder / f.name).is_dir()]
-    return tuple(f.relative_to(path).as_posix() for f in taken if f not in twice)
+def _used(path: Path, folder: Path, *pictures: list[Path]) -> tuple[str, ...]:
+    """The files of an episode that are read, below the recording."""
+    of_episode = [folder.parent / name for name in ("metadata.json", "timestamp.txt")]
+    state = [f for where in _state_folders([folder, folder.parent]) for f in list_images(where, (".npy",))]
+    every = (*of_episode, *state, *(f for files in pictures for f in files))
+    return tuple(f.relative_to(path).as_posix() for f in every if f.is_relative_to(path))
+
+
+def _passed_over(path: Path, folder: Path, timed: bool) -> tuple[tuple[str, str], ...]:
+    """What such episodes have beside what is used."""
+    others = [c.relative_to(path).as_posix() for c in _cameras(path) if c != folder]
+    known = [(name, "of another camera") for name in others]
+    color = (folder / "color").relative_to(path).as_posix()
+    known += [(f"{color}/*{suffix}", "taken after 'finish_time'") for suffix in COLOR_SUFFIXES if timed]
+    if _state_folders([folder, folder.parent]):
+        known += [(f"{at}{name}", "RH20T's other numbers of the robot") for at in ("", "*/") for name in _OTHERS]
+    return (*known, *((f"{at}timestamps.npy", "the names tell the times") for at in ("", "*/")))
 
 
 def _after_finish(folder: Path, count: int) -> tuple[Check, ...]:
@@ -113,10 +134,10 @@ def _choose(episode: Path, serial: str | None) -> Path:
     )
 
 
-def _about(file: Path) -> dict[str, Any]:
-    """What ``metadata.json`` says that matters here."""
+def _about(file: Path) -> tuple[dict[str, Any], list[str]]:
+    """What ``metadata.json`` says that matters here, and its keys that are not RH20T's."""
     if not file.is_file():
-        return {}
+        return {}, []
     values = read_json(file, "correct it, or delete it")
     if not isinstance(values, dict):
         raise DataError(f"{file}: holds {shown(values)}, expected names and values")
@@ -124,7 +145,7 @@ def _about(file: Path) -> dict[str, Any]:
     for key in ("finish_time", "rating"):
         if key in found and not (isinstance(found[key], int | float) and abs(found[key]) < _LATEST_MS):
             raise DataError(f"{file}: '{key}' is {shown(found[key])}, expected a number")
-    return found
+    return found, sorted(map(str, values.keys() - _KNOWN))
 
 
 def _timed(folder: Path, suffixes: Sequence[str], stop_ms: float = np.inf) -> tuple[list[Path], np.ndarray, Timing]:
@@ -143,14 +164,17 @@ def _timed(folder: Path, suffixes: Sequence[str], stop_ms: float = np.inf) -> tu
 def _state(folders: list[Path]) -> tuple[SampleStream, ...]:
     """Pose of the tool (position and quaternion) and command of the gripper, where they were recorded."""
     found = []
-    for name in STATE:
-        folder = next((f / name for f in folders if (f / name).is_dir()), None)
-        if folder is None:
-            continue
+    for folder in _state_folders(folders):
         files, stamps, timing = _timed(folder, (".npy",))
         if files:
-            found.append(SampleStream(name, stamps, _rows(files), timing))
+            found.append(SampleStream(folder.name, stamps, _rows(files), timing))
     return tuple(found)
+
+
+def _state_folders(folders: list[Path]) -> list[Path]:
+    """Those of the robot's state, each from the first of some folders that has it."""
+    found = (next((f / name for f in folders if (f / name).is_dir()), None) for name in STATE)
+    return [folder for folder in found if folder is not None]
 
 
 def _rows(files: list[Path]) -> np.ndarray:

@@ -10,7 +10,7 @@ from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_bag import RosBag
 from flowlab.recordings.readers.ros_camera_info import intrinsics_over_time
 from flowlab.recordings.readers.ros_messages import depth_unit_of, relative_pose
-from flowlab.recordings.readers.ros_topics import REGISTERED, ChosenTopics, camera_of
+from flowlab.recordings.readers.ros_topics import REGISTERED, ChosenTopics, camera_of, of_two_cameras
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import shown
 
@@ -37,6 +37,8 @@ def find_calibration(
         known[what], told = (None, []) if info is None else intrinsics_over_time(bag, info, topic, own, about)
         checks += told
     registered, check = _registered(topics, frames, known["color"], known["depth"])
+    if registered is not False and of_two_cameras(topics.color, topics.depth):
+        check = _of_two(topics, check, given.topics.color is not None and given.topics.depth is not None)
     found: list[tuple[str | None, dict[str, Any]]] = [(topics.color_info, {"intrinsics": known["color"]})]
     if registered is False:
         found.append((topics.depth_info, {"depth_intrinsics": known["depth"]}))
@@ -58,21 +60,32 @@ def _registered(
                 "'topics: {depth: ...}', or give 'depth_intrinsics' and 'T_color_depth'")  # fmt: skip
         return True, Check("camera_info", Verdict.REFUSED, says)
     if name is not None and camera_of(topics.color) != camera_of(topics.depth) and frames[0] != frames[1]:
-        says = (f"{topics.depth} is called {name}, but is of frame '{shown(frames[1])}' and {topics.color} of frame "
-                f"'{shown(frames[0])}': of two cameras, it seems; choose the topics of one with 'topics'")  # fmt: skip
+        says = (f"{topics.depth} is called {name}, but is of frame {shown(frames[1])} and {topics.color} of frame "
+                f"{shown(frames[0])}: of two cameras, it seems; choose the topics of one with 'topics'")  # fmt: skip
         return True, Check("camera_info", Verdict.DOUBTFUL, says)
     if name is not None:
         return True, Check("camera_info", Verdict.OK, f"{topics.depth} is registered to color, as its name says")
     if not frames[0] == frames[1] != "":
-        says = f"color is seen from frame '{shown(frames[0])}', depth from '{shown(frames[1])}'"
+        says = f"color is seen from frame {shown(frames[0])}, depth from {shown(frames[1])}"
         return False, Check("camera_info", Verdict.OK, says)
-    where = f"color and depth are both in frame '{shown(frames[0])}'"
+    where = f"color and depth are both in frame {shown(frames[0])}"
     if differ:
         says = f"{where}, but seen by different cameras: {_words(depth)} and {_words(color)}; not taken as registered"
         return False, Check("camera_info", Verdict.OK, says)
     if depth is None or color is None:
         return None, Check("camera_info", Verdict.ASSUMED, f"{where}; whether by the same camera is not told")
     return True, Check("camera_info", Verdict.OK, f"{where}, with the same intrinsics")
+
+
+def _of_two(topics: ChosenTopics, found: Check, stated: bool) -> Check:
+    """What is said of topics whose names tell two cameras, though depth is taken as seen from the color camera."""
+    says = f"{found.says}; but {topics.color} and {topics.depth} are of two cameras, by their names"
+    if found.verdict.severity >= Verdict.DOUBTFUL.severity:
+        return found
+    if stated:
+        return Check("camera_info", Verdict.ASSUMED, f"{says}, and chosen with 'topics'")
+    says += "; choose those of one, or say so of these, with 'topics: {color: ..., depth: ...}'"
+    return Check("camera_info", Verdict.DOUBTFUL, says)
 
 
 def _alike(a: Intrinsics, b: Intrinsics) -> bool:

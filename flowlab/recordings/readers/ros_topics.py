@@ -1,5 +1,6 @@
 """Which topics of a ROS recording are read: those of one camera and of the robot, by type, encoding and name."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,11 @@ INFO = "sensor_msgs/msg/CameraInfo"
 JOINTS = "sensor_msgs/msg/JointState"
 REGISTERED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_color")
 """What the topics of depth that is seen from the color camera are called."""
+_OF_STREAMS = re.compile(
+    r"(rgb|colou?r|depth|ir|infra\d*|mono|gray|image|img|video|stereo|aligned|registered|registration|to|sw|hw|raw|rect|"
+    r"rectified|undistorted|compressed|compresseddepth|preview|isp|node|\d)"
+)
+"""Words that tell the pictures of one camera apart."""
 COMPRESSED = ("compressed", "compressedDepth")
 
 
@@ -110,6 +116,18 @@ def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int
 def camera_of(topic: str) -> str:
     """The namespace of a camera's topics."""
     return topic.strip("/").partition("/")[0]
+
+
+def of_two_cameras(color: str, depth: str) -> bool:
+    """Whether two topics are of two cameras by their names: each has a word before the last that the other lacks."""
+    a, b = (_words_of(topic.rpartition("/")[0]) for topic in (color, depth))
+    return bool(a - b and b - a)
+
+
+def _words_of(path: str) -> set[str]:
+    """The words of a topic's path that do not say which picture of a camera it is."""
+    words = re.split(r"[_\W]+", re.sub(r"/sensor_\d+", "", path.lower()))
+    return {word for word in words if word and not _OF_STREAMS.fullmatch(word)}
 
 
 def _info_of(topic: str, infos: Mapping[str, int]) -> str | None:

@@ -76,15 +76,22 @@ class TUMReader:
             known=tuple(known),
             registered=True,
             checks=checks,
-            used=(
-                *LISTS,
-                *ASSOCIATIONS,
-                GROUND_TRUTH,
-                TRUE_TRACKS,
-                *(Path(entry[1]).as_posix() for entry in (*color, *depth)),
-            ),
+            used=(*lists, GROUND_TRUTH, TRUE_TRACKS, *(Path(entry[1]).as_posix() for entry in (*color, *depth))),
+            passed_over=_passed_over(lists, color, depth),
             poses=poses,
         )
+
+
+def _passed_over(
+    lists: Sequence[str], color: Sequence[tuple[str, ...]], depth: Sequence[tuple[str, ...]]
+) -> tuple[tuple[str, str], ...]:
+    """What such folders have beside what is used."""
+    known = [("accelerometer.txt", "how the camera was accelerated")]
+    if lists[0] == lists[1]:  # associations leave out pictures without a partner
+        folders = {Path(entry[1]).parent.as_posix() for entry in (*color, *depth)}
+        known += [(f"{folder}/*.png", f"not in {lists[0]}") for folder in sorted(folders - {"."})]
+        return (*known, *((name, f"{lists[0]} is used") for name in (*LISTS, *ASSOCIATIONS)))
+    return (*known, *((name, "the lists are used") for name in ASSOCIATIONS))
 
 
 def _ground_truth(file: Path) -> tuple[SampleStream | None, tuple[Check, ...]]:

@@ -44,6 +44,7 @@ class GLRenderer:
         d = self._data
         d.geom_xpos[:], d.geom_xmat[:] = poses.geom_pos, poses.geom_mat
         d.site_xpos[:], d.site_xmat[:] = poses.site_pos, poses.site_mat
+        d.cam_xpos[:], d.cam_xmat[:] = poses.cam_pos, poses.cam_mat
         self._renderer.update_scene(d, self._settings.camera.name, self._options)
         self._renderer.enable_depth_rendering()
         depth = self._renderer.render().copy()

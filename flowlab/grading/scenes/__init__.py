@@ -1,0 +1,1 @@
+"""Procedural scenes with exact tracks, to grade trackers on what they were not made for."""
