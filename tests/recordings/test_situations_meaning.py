@@ -116,6 +116,8 @@ def test_a_simple_motion_is_no_clock() -> None:
         ("x\n0,050\n0,100\n", "one number, 0.050"),
         ("-0,25,1,75\n0,50,1,50\n", "one number, -0.25"),
         ("1,5,2,8\n1,9,3,1\n2,3,3,4\n2,7,3,7\n3,1,4,0\n", "one number, 1.5"),
+        ("1,25e-1,0,20\n1,35e-1,0,21\n", "the cells 1 and 25e-1 may be one number, 1.25e-1"),
+        ("0,5E+1\n1,2\n", r"one number, 0\.5E\+1"),
         ("x;y\n1.200,5;2,5\n1.201,5;2,5\n", r"line 2 has '1\.200,5', with a decimal comma or a sign between thousands"),
         ('x,y\n"0,100","0,250"\n', "line 2 has '0,100', with a decimal comma"),
         ("x,y,z\n1,2\n", "line 2 has 2 cells, expected 3, as many as names: '1,2'"),
@@ -123,6 +125,8 @@ def test_a_simple_motion_is_no_clock() -> None:
         ("0,1,0,1\n1,0,0,1\n0,0,1,1\n", ""),
         ("100,200,300,400\n150,250,310,410\n", ""),
         ("a,b\n1,050\n2,100\n", ""),
+        ("a,b\n1,25e-1\n2,35e-1\n", ""),
+        ("1e3,25e-1\n2e3,35e-1\n", ""),
     ],
 )  # fmt: skip
 def test_commas_within_numbers_are_asked_about(text: str, says: str) -> None:
