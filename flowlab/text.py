@@ -10,8 +10,8 @@ _UNPRINTABLE = re.compile(
     r"[\x00-\x09\x0b-\x1f\x7f-\xa0\xad\u061c\u1680\u180e\u2000-\u200b\u200e\u200f\u2028-\u202f\u205f-\u206f\u3000\ufeff"
     r"\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e007f]"
 )
-"""Controls, terminal escapes, turns of the writing direction, what is not seen or looks like a space and is none, halves
-of characters; not the end of a line, nor what joins letters."""
+"""Controls, terminal escapes, turns of the writing direction, what is not seen or only looks like a space, halves of
+characters; not the end of a line, nor what joins letters."""
 _MARKUP = re.compile(r"[\\`*_\[\]<>|&~$#!]")
 _LONGEST_NAME = 150
 """Bytes; file systems take 255, and a file in the making has a longer name."""

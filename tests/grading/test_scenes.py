@@ -13,7 +13,7 @@ from flowlab.grading import ground_truth
 from flowlab.grading.grade import read_clip
 from flowlab.grading.ground_truth import GroundTruth, scene_of
 from flowlab.grading.scenes.camera_paths import look_at
-from flowlab.grading.scenes.families import FAMILIES
+from flowlab.grading.scenes.families import FAMILIES, making_films
 from flowlab.grading.scenes.film import FilmSettings, make_film
 from flowlab.grading.scenes.motions import carried, progress, shifted, still, turned
 from flowlab.grading.scenes.textures import make_texture
@@ -101,6 +101,12 @@ def test_names_that_do_not_exist(tmp_path: Path) -> None:
 def test_two_families_are_held_out_and_the_help_names_all() -> None:
     assert sum(f.held_out for f in FAMILIES.values()) == 2
     assert ", ".join(FAMILIES) == _FAMILIES
+
+
+def test_trackers_are_made_with_seen_families_and_low_seeds_alone() -> None:
+    assert {name for name, _ in making_films([0, 999])} == {f.name for f in FAMILIES.values() if not f.held_out}
+    with pytest.raises(UsageError, match="seed 1000 is for reporting"):
+        making_films([0, 1000])
 
 
 class TestPaths:
