@@ -10,9 +10,9 @@ from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.dates import check_no_dates
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.numbering import check_numbers
 from flowlab.recordings.record_times import choose_clock, was_set_back
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.stamps import SECONDS, Timing, UnclearStamps, Unit, decide_sample_unit, decide_unit, kept_every
 from flowlab.recordings.sync import find_gaps, sampling_rate
 from flowlab.recordings.verdicts import Check, Verdict

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 

@@ -10,8 +10,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import TRUE_TRACKS, Metadata
 from flowlab.recordings.poses import pose_stream, read_poses
+from flowlab.recordings.recording_yaml import TRUE_TRACKS, Metadata
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import is_path_inside, shown

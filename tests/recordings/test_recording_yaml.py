@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from flowlab.errors import DataError
 from flowlab.recordings.base import load_readers
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import Metadata, combine, load_metadata
 from flowlab.recordings.readers.plain import write_rgbd_recording
 from flowlab.recordings.recording import RecordingSettings, describe
+from flowlab.recordings.recording_yaml import Metadata, combine, load_metadata
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text()
 
