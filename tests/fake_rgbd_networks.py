@@ -223,6 +223,7 @@ class SpaTrackerPredictor(nn.Module):
         pictures = interpolate(video[0], self.interp_shape, mode="bilinear").permute(0, 2, 3, 1) / 255
         depth = interpolate(video_depth, self.interp_shape, mode="nearest")[:, 0]
         asked = torch.cat([queries[0, :, :1], queries[0, :, 1:] * scale], 1)
+        self.asked = asked
         xy, visible = _followed(pictures, asked)
         tracks = torch.cat([xy / scale, _depth_at(depth, xy)[..., None]], -1) * self.model.scale
         return tracks[None], visible[None], queries[..., 0].to(torch.uint8)

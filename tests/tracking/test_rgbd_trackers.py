@@ -12,6 +12,7 @@ import pytest
 import torch
 from fake_networks import SIZE
 from fake_rgbd_networks import (
+    SLOPE,
     slanted,
     write_spatialtracker,
     write_spatialtracker2,
@@ -68,7 +69,13 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Maker:
         "spatialtracker": tmp_path / "spaT_final.pth",
         "spatialtracker2": write_spatialtracker2_weights(tmp_path / "offline"),
     }
-    return lambda name, **options: make_tracker(name, {"repo": repos[name], "weights": files[name], **options})
+    quick = {"resolution_factor": 1}
+
+    def made(name: str, **options: Any) -> Tracker:
+        given = {"repo": repos[name], "weights": files[name], **(quick if name == "tapip3d" else {}), **options}
+        return make_tracker(name, given)
+
+    return made
 
 
 @ALL
@@ -94,6 +101,7 @@ def check_tracks(found: Tracks2D, xy: np.ndarray, xyz: np.ndarray, queries: np.n
         np.testing.assert_allclose(found.xyz_cam[at + 1 :, k], xyz[start:][at + 1 : len(found.xy), k % 2], atol=0.002)
         np.testing.assert_array_equal(found.xyz_cam[:at, k], 0)
         assert np.abs(found.xyz_cam[at, k] - xyz[start + at, k % 2]).max() < 0.01  # of the nearest pixel
+        assert abs(found.xyz_cam[at, k, 2] - 1 - SLOPE * pixel[0]) < 1e-5  # as read there
         assert found.visible[:, k].tolist() == [row >= at for row in range(len(found.xy))]
 
 
@@ -173,6 +181,24 @@ def test_queries_of_tapip3d_are_in_the_world_and_its_support_is_left_out(make: M
     np.testing.assert_allclose(given[:2], np.insert(world, 0, [0, 3], 1), atol=1e-5)
     assert len(given) == 2 + 16**2
     assert found.xy.shape == (18, 2, 2)
+
+
+@pytest.mark.parametrize(("factor", "size"), [(1, (96, 144)), (2, (135, 203))])
+def test_tapip3d_sees_more_pixels_than_it_was_trained_on(make: Maker, factor: int, size: tuple[int, int]) -> None:
+    tracker = make("tapip3d", resolution_factor=factor)
+    clip, xy, xyz = slanted()
+    queries = asked(xy, 0, 0)
+    check_tracks(tracker.open(clip).track(queries, 0, 20), xy, xyz, queries, 0)
+    assert weights._loaded(tracker).model.image_size == size
+
+
+def test_spatialtracker_is_asked_for_what_becomes_pixel_centers(make: Maker) -> None:
+    """By hand: pictures of 256 by 384 become twice as wide, so the first pixel's center lies at (0.5, 0) there."""
+    clip, _, _ = slanted(frames=2, size=(256, 384))
+    tracker = make("spatialtracker")
+    tracker.open(clip).track(np.float32([[0, 0, 0], [1, 255, 383]]), 0, 2)
+    expected = [[0, 0.5, 0], [1, 2 * 255 + 0.5, 383]]
+    np.testing.assert_allclose(weights._loaded(tracker).model.asked.numpy(), expected, atol=1e-4)
 
 
 def test_a_resized_camera_sees_the_same(make: Maker) -> None:
@@ -259,11 +285,13 @@ class TestCode:
         import json
 
         code, path = Checkout(tmp_path / "code"), list(sys.path)
-        for _ in range(2):
+        for entered in range(2):
             with code:
                 import json as own
 
                 assert own.mine
+                assert hasattr(own, "kept") == bool(entered)
+                own.kept = True
         assert sys.modules["json"] is json
         assert sys.path == path
 
