@@ -22,6 +22,7 @@ _LABEL = re.compile(
     r"(^|[._])(\w*_)?(episode|trial|take|demo|task|seed|version|serial|user|operator|subject|session|id|index)"
     r"(_?(id|ids|index|idx|number|num|no|nr))?$"
 )
+_STEP = re.compile(r"(^|_)(time)?(step|frame)s?(_?(index|id|idx|number|no))?$")
 """What a number with such a name counts is neither a place nor a time."""
 _TELLS = re.compile(r"fps|rate|hz|unit|scale|time|stamp|frame|pose|cam|convention|axes|model|lens|dist|matrix|coord")
 """What has one of these in its name may matter, though it is a text."""
@@ -33,6 +34,8 @@ def states_what_is_used(source: "ParsedRecording", name: str, contents: Contents
     if contents.leaves:
         return all(_is_used(source, key, value) for key, value in contents.leaves)
     values = contents.values
+    if values is not None and values.ndim == 1 and values.dtype.kind in "iu" and len(np.unique(np.diff(values))) == 1:
+        return _LABEL.search(name.lower()) is not None or _STEP.search(name.lower()) is not None
     return values is not None and values.size > 0 and values.ndim <= 3 and _is_used_array(source, name, values)
 
 
