@@ -41,10 +41,11 @@ def digest(picture: np.ndarray) -> PictureDigest:
     gray = picture[..., 1] if picture.ndim == 3 else picture
     step = max(1, gray.shape[0] // 24), max(1, gray.shape[1] // 32)
     small = np.nan_to_num(gray[:: step[0], :: step[1]].astype(np.float32), posinf=0, neginf=0)
-    tiles = [tile for rows in np.array_split(picture, _TILES, 0) for tile in np.array_split(rows, _TILES, 1)]
-    sums = tuple(zlib.crc32(tile.tobytes()) if tile.size else 0 for tile in tiles)
-    nothing = (not tile.size or bool((tile == tile[0, 0]).all()) for tile in tiles)
-    plain = tuple(0 if flat else number for number, flat in zip(sums, nothing, strict=True))
+    rows, columns = (np.linspace(0, side, _TILES + 1).astype(int).tolist() for side in gray.shape)
+    tiles = [picture[a:b, c:d].tobytes() for a, b in pairwise(rows) for c, d in pairwise(columns)]
+    pixel = picture[:1, :1].nbytes
+    sums = [zlib.crc32(tile) for tile in tiles]
+    plain = tuple(0 if tile == tile[:pixel] * (len(tile) // pixel) else n for tile, n in zip(tiles, sums, strict=True))
     return PictureDigest(zlib.crc32(np.array(sums, np.uint32).tobytes()), plain, small)
 
 

@@ -19,6 +19,8 @@ from flowlab.recordings.verdicts import Check
 
 _NEAR = 0.55
 """So many intervals away a sample may be that is the nearest of a stream without a loss."""
+_ROUNDING_S = 1e-6
+"""Times are sums of floating point: what lies just at a limit is within it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +96,8 @@ def check_frames(
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
-    max_sync_s = min(max_sync_s, _half(streams.color))
-    max_state = {s.name: min(max_state_s, max(_half(streams.color), _half(s))) for s in streams.state}
+    max_sync_s = min(max_sync_s, _half(streams.color)) + _ROUNDING_S
+    max_state = {s.name: min(max_state_s, max(_half(streams.color), _half(s))) + _ROUNDING_S for s in streams.state}
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}

@@ -7,6 +7,7 @@ import numpy as np
 
 from flowlab.recordings.base import SampleStream
 from flowlab.recordings.clock_numbers import ClockColumn, find_clocks
+from flowlab.recordings.odd_rows import frozen_rows, no_readings
 from flowlab.recordings.turns import find_turns
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
@@ -24,7 +25,7 @@ def check_numbers(source: "ParsedRecording") -> Iterator[Check]:
         chosen = getattr(source.metadata, f"{what}_columns") is not None
         found = [c for s in streams for c in _looked_at(s, what, chosen, source)]
         width = sum(s.values.shape[1] for s in streams)
-        says = f"none of {width} numbers goes as a clock does, or leaps as those of two robots in turn"
+        says = f"none of {width} numbers goes as a clock does, leaps as those of two robots in turn, or froze"
         yield from found or [Check(f"{what} numbers", Verdict.OK, says)]
 
 
@@ -33,6 +34,16 @@ def _looked_at(stream: SampleStream, what: str, chosen: bool, source: "ParsedRec
     if not chosen:
         yield from _times(stream, what, source.write_to)
     yield from _turns(stream, source.metadata.one_robot, source.write_to)
+    if what == "state":  # an action may be none for long
+        yield from _odd_rows(stream)
+
+
+def _odd_rows(stream: SampleStream) -> Iterator[Check]:
+    """Doubts about rows that are no readings."""
+    values = stream.values[np.argsort(stream.time_s, kind="stable")].astype(np.float64)
+    for says in filter(None, (no_readings(values, stream.columns), frozen_rows(values))):
+        yield Check(f"{stream.name} numbers", Verdict.DOUBTFUL, f"{says}; take such rows out of the recording: frames "
+                    "without a row near them are left out")  # fmt: skip
 
 
 def _times(stream: SampleStream, what: str, write_to: str) -> Iterator[Check]:

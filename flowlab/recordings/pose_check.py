@@ -52,6 +52,8 @@ _MOST = 0.75
 """In so many of the pairs."""
 _SHIFT_M = 0.003
 """And by no less than this [m]."""
+_REFITS = 4
+"""Times that a rigid motion is fitted to the half of the points that fit best."""
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
 _READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     **READINGS,
@@ -78,6 +80,17 @@ class _Pair:
         """How wide a pixel is at every point, by how far apart points are that are as far apart in the picture [m]."""
         return self.first[:, 2] * self.pixel_rad
 
+    def is_rigid(self, off_m: float) -> bool:
+        """Whether some rigid motion takes most points to within so much; if none does, they were not found again."""
+        inside = np.ones(len(self.first), bool)
+        for _ in range(_REFITS):
+            a, b = self.first[inside], self.second[inside]
+            U, _, Vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+            R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+            left = np.linalg.norm((self.first - a.mean(0)) @ R.T + b.mean(0) - self.second, axis=1)
+            inside = left <= np.median(left)
+        return bool(np.median(left) < off_m)
+
     def off_m(self, T: Float[np.ndarray, "T 4 4"]) -> float:
         """How far apart they are in the world, in the median."""
         a, b = (apply(T[r], p) for r, p in zip(self.rows, (self.first, self.second), strict=True))
@@ -88,7 +101,7 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     """Whether the scene stands still under the poses, and whether it does so only by another reading of them."""
     T = source.frame_check.T_world_cam
     assert T is not None
-    pairs = list(_pairs(source))
+    pairs = [pair for pair in _pairs(source) if pair.is_rigid(_floor_m([pair]))]
     if not pairs:
         says = "it moves as its poses say; too little texture and depth in the pictures to tell whether these are right"
         return Check("camera", Verdict.ASSUMED, says)
@@ -99,12 +112,18 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     return Check("camera", verdict, f"it moves{says}: {seen}" if verdict is Verdict.OK else f"{seen}{says}")
 
 
+def _floor_m(pairs: list[_Pair]) -> float:
+    """What sensors and flow err by [m]."""
+    far, pixel = (float(np.median([np.median(x) for x in of])) for of in
+                  ([p.first[:, 2] for p in pairs], [p.pixel_m for p in pairs]))  # fmt: skip
+    return _FLOOR[0] + _FLOOR[1] * far + _OF_PIXEL * pixel
+
+
 def _judged(source: "ParsedRecording", pairs: list[_Pair], off: float, fixed: float) -> tuple[Verdict, str]:
     """What follows from how far apart points are under the poses, and would be without [m]."""
     T = source.frame_check.T_world_cam
     assert T is not None
-    pixel = float(np.median([np.median(p.pixel_m) for p in pairs]))
-    floor = _FLOOR[0] + _FLOOR[1] * float(np.median([np.median(p.first[:, 2]) for p in pairs])) + _OF_PIXEL * pixel
+    floor = _floor_m(pairs)
     late, best, unshifted = _best_offset(source, pairs)
     if best < min(_SHIFTED * unshifted, floor) and unshifted - best > _SHIFT_M and not come_again(T):
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)

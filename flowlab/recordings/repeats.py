@@ -154,19 +154,19 @@ def find_repeats(
             else:
                 (at_once if one.stopped_at_once(first, last) else still).update(again)
     doubts: list[str] = []
-    for name, one in zip(("color", "depth"), seen, strict=True):
+    for name, one, other in zip(("color", "depth"), seen, seen[::-1], strict=True):
         older = older_pictures(one.kept, one.noisy, one.change)
         whose = "" if one is seen[0] else "its depth picture "
         bad |= {k: f"{whose}equals {one.name(k0)} bit by bit, and others lie between: an older picture came again"
                 for k, k0 in older.items() if k not in bad}  # fmt: skip
-        doubts += _stale(name, one, {*older, *(np.flatnonzero(one.same) + 1).tolist()})
+        doubts += _stale(name, one, other, {*older, *(np.flatnonzero(one.same) + 1).tolist()})
     return bad, _check(
         bad, {k: n for k, n in named.items() if k not in bad}, still - {*bad, *named, *at_once}, at_once - {*bad},
         doubts, seen,
     )  # fmt: skip
 
 
-def _stale(name: str, pictures: _Pictures, told: set[int]) -> Iterator[str]:
+def _stale(name: str, pictures: _Pictures, other: _Pictures, told: set[int]) -> Iterator[str]:
     """What is doubtful of the pictures of a stream that have noise, and are not the same as a whole."""
     skip = np.isin(np.arange(len(pictures.kept)), list(told))
     parts = repeated_parts(pictures.kept, skip) if pictures.noisy else {}
@@ -175,7 +175,9 @@ def _stale(name: str, pictures: _Pictures, told: set[int]) -> Iterator[str]:
         yield (f"in {len(parts)} {name} pictures, from {pictures.name(min(parts))} on, {share:.0%} of each is "
                "that of an earlier one bit by bit, though it has noise: a part froze, or buffers tore")  # fmt: skip
         return
-    again = [run for run in encoded_anew(pictures.kept) if not told.issuperset(range(run[0] + 1, run[1] + 1))]
+    again = [
+        run for run in encoded_anew(pictures.kept, other.kept) if not told.issuperset(range(run[0] + 1, run[1] + 1))
+    ]
     if again:
         first, last = pictures.name(again[0][0]), pictures.name(again[-1][1])
         yield (f"{name} changes from {first} to {last} by far less than the noise of the other pictures: one may have "

@@ -23,6 +23,8 @@ _QUIET = 0.75
 """Share of the pixels, those that change least, by which noise is measured beside a thing that moves."""
 _BELOW = 0.7
 """Pictures that change by less than this share of their film's noise are one, encoded anew."""
+_RESTS = 0.8
+"""Where the other stream changes by less than this share of what it does, it is the camera or the scene that rests."""
 _EVEN = 1.5
 """Noise changes pictures by about the same from one to the next."""
 
@@ -77,6 +79,15 @@ def repeated_parts(kept: Sequence[PictureDigest], skip: Bool[np.ndarray, "T"]) -
     return {int(row): float(again[row].mean()) for row in rows} if len(rows) >= _RUN else {}
 
 
+def _quiet_change(kept: Sequence[PictureDigest]) -> Float64[np.ndarray, "N"] | None:
+    """By how much the quieter part of each picture differs from the one before; None of pictures of several sizes."""
+    if len({k.small.shape for k in kept}) != 1:
+        return None
+    small = np.array([k.small for k in kept], np.float32)
+    change = np.sort(np.abs(np.diff(small, axis=0)).reshape(len(small) - 1, -1), axis=1)
+    return np.asarray(change[:, : max(1, int(_QUIET * change.shape[1]))].mean(1), np.float64)
+
+
 def _tiles_with_noise(kept: Sequence[PictureDigest], tiles: Int64[np.ndarray, "T K"]) -> Bool[np.ndarray, "K"]:
     """Which tiles change in many of their pixels wherever they change at all."""
     differ = np.diff(np.array([k.small for k in kept]), axis=0) != 0
@@ -96,14 +107,21 @@ def _seen_before(column: Int64[np.ndarray, "T"]) -> Bool[np.ndarray, "T"]:
     return seen
 
 
-def encoded_anew(kept: Sequence[PictureDigest]) -> list[tuple[int, int]]:
-    """First and last row of runs that change by far less than the noise of the others, as of one encoded again."""
-    if len({k.small.shape for k in kept}) != 1:
+def encoded_anew(kept: Sequence[PictureDigest], other: Sequence[PictureDigest]) -> list[tuple[int, int]]:
+    """First and last row of runs that change by far less than the noise of the others, as of one encoded again.
+
+    Args:
+        kept: Of a stream.
+        other: Of the other stream in the same rows: where that rests too, it is the scene that does.
+    """
+    quiet = _quiet_change(kept)
+    if quiet is None:
         return []
     small = np.array([k.small for k in kept], np.float32)
-    change = np.sort(np.abs(np.diff(small, axis=0)).reshape(len(small) - 1, -1), axis=1)
-    quiet = change[:, : max(1, int(_QUIET * change.shape[1]))].mean(1)
     low = quiet < _BELOW * np.median(quiet)
+    beside = _quiet_change(other)
+    if beside is not None:
+        low &= beside >= _RESTS * np.median(beside)
     found = [(a, b) for a, b in runs(low) if b - a >= _RUN]
     others = np.concatenate([[True], ~low])
     if not found or not has_noise(small[others]):

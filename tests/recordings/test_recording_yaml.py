@@ -46,6 +46,10 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ),
         ("intrinsics: {fx: true, fy: 1, cx: 0, cy: 0}", "'fx' holds true or false"),
         ("fps: 10\ntask: pour\nfps: 20", "'fps' stands twice, in lines 1 and 3; keep one"),
+        (
+            "intrinsics: {fx: 1, fy: 1, cx: 0, cy: 0, width: 1" + "0" * 400 + "}",
+            "intrinsics.width: .* less than or equal",
+        ),
         ("intrinsics:\n  fx: 60\n  fx: 90", "'fx' stands twice, in lines 2 and 3"),
         ("depth_unit_m: millimeter", r"depth_unit_m: .* \(found 'millimeter'\)"),
         ("- fps", "must be a mapping"),

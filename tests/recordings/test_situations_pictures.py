@@ -76,6 +76,14 @@ def test_a_standing_camera_is_known_to_stand(still: Frames, tmp_path: Path, caps
     assert said(capsys, tmp_path / "light", "camera", light)[0] == "ok"
 
 
+def test_what_passes_before_a_camera_is_no_motion_of_it(tmp_path: Path, capsys: Capture) -> None:
+    """It fills the picture for some frames, and then the scene is where it was."""
+    large = Box((-1.6, -0.35, 0.4), (0.7, 0.05, 0.7), (150, 90, 60), contrast=90.0)
+    frames = filmed(lambda t: POSE, large, 0.12, 30)
+    verdict, says = said(capsys, tmp_path / "r", "camera", frames)
+    assert verdict in ("assumed", "ok"), says
+
+
 def test_what_pictures_do_not_show_is_assumed(still: Frames, tmp_path: Path, capsys: Capture) -> None:
     rng = np.random.default_rng(0)
     dark = [(rng.normal(rgb * 0.04 + 4, 2).clip(0, 255).astype(np.uint8), depth) for rgb, depth in still]
