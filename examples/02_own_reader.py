@@ -23,8 +23,8 @@ import numpy as np
 from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
-from flowlab.recordings.metadata import Intrinsics, Metadata
 from flowlab.recordings.recording import RecordingSettings, describe
+from flowlab.recordings.recording_yaml import Intrinsics, Metadata
 from flowlab.testing.readers import check_reader
 
 

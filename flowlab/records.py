@@ -201,7 +201,8 @@ class PositionSource(IntEnum):
     MEASURED = 1
     """Followed in the picture, and its depth read there by the sensor."""
     MODEL = 2
-    """Carried by a rigid motion that was fitted to the pictures; so may a point out of sight be."""
+    """Carried by a rigid motion that was fitted to the pictures, or put there by a network that hands over 3D; so may
+    a point out of sight be."""
     FILLED = 3
     """Neither: interpolated between instants at which it was known, or held at the last."""
 

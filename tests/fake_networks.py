@@ -71,7 +71,8 @@ def _followed(video: torch.Tensor, queries_txy: torch.Tensor) -> tuple[torch.Ten
     if float(video[0].median()) > 0.1:
         return _flowed(video, queries_txy)
     colors = [_color(video[int(t)], x, y) for t, x, y in queries_txy.tolist()]
-    found = [[_center(picture, color) for color in colors] for picture in video]
+    centers = [{color: _center(picture, color) for color in set(colors)} for picture in video]
+    found = [[at[color] for color in colors] for at in centers]
     xy = torch.stack([torch.stack([at for at, _ in row]) for row in found])
     return xy, torch.tensor([[seen for _, seen in row] for row in found])
 
@@ -320,12 +321,16 @@ class TAPNextTrackingState:
 
 
 class TAPNext(nn.Module):
-    """Positions are (y, x), as its queries."""
+    """Positions are (y, x), as its queries, of a square of 256, whatever the size of the pictures."""
 
     def __init__(self, image_size: tuple[int, int]) -> None:
         super().__init__()
+        _require(image_size == (256, 256), "all published weights have the position embedding of 32 by 32 patches")
         self.image_size = image_size
         self.scale = nn.Parameter(torch.zeros(1))
+
+    def _video_pos_emb(self, h: int, w: int) -> None:
+        _require(h == w, "pictures are squares")
 
     def forward(
         self,
@@ -334,7 +339,9 @@ class TAPNext(nn.Module):
         state: TAPNextTrackingState | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, TAPNextTrackingState]:
         _check_tapnet(video)
-        _require(tuple(video.shape[2:4]) == self.image_size, "pictures have the size of the position embedding")
+        self._video_pos_emb(*video.shape[2:4])
+        self.side = video.shape[2]
+        finer = self.side / 256
         _require(video.shape[:2] == (1, 1), "the stand-in takes one frame at a time")
         if state is None:
             assert query_points is not None
@@ -343,11 +350,11 @@ class TAPNext(nn.Module):
         self.asked = state.query_points[0]
         pictures = torch.stack([*state.hidden_state, (video[0, 0] + 1) / 2])
         known = self.asked[:, 0] <= state.step
-        asked = torch.cat([self.asked[known, :1], self.asked[known, 1:].flip(1) - 0.5], 1)
+        asked = torch.cat([self.asked[known, :1], self.asked[known, 1:].flip(1) * finer - 0.5], 1)
         yx, seen = torch.zeros(len(known), 2), torch.zeros(len(known), dtype=torch.bool)
         if known.any():
             xy, visible = _followed(pictures, asked)
-            yx[known], seen[known] = (xy[-1].flip(1) + 0.5) * self.scale, visible[-1]
+            yx[known], seen[known] = (xy[-1].flip(1) + 0.5) / finer * self.scale, visible[-1]
         bins = [one_hot(yx[:, k].long().clamp(0, 255), 256) for k in (0, 1)]
         logits = torch.where(seen, 3.0, -3.0)[None, None, :, None]
         after = TAPNextTrackingState(state.step + 1, state.query_points, list(pictures))

@@ -45,6 +45,10 @@ class TestText:
         message.encode("utf-8")
         assert printable(message) == message
 
+    def test_what_looks_like_a_space_and_is_none_is_shown(self) -> None:
+        assert shown("left\xa0arm\u2003x\u3000") == r"'left\xa0arm\u2003x\u3000'"
+        assert shown("left arm") == "'left arm'"
+
     def test_what_was_found_is_cut(self) -> None:
         bomb = ["x" * 1000] * 1000
         for _ in range(30):

@@ -60,17 +60,6 @@ class ReplayBuffer:
         """Names of the tasks, sorted."""
         return tuple(sorted({e.task for e in self.episodes}))
 
-    def split(self, demonstrations: int | None, held_out: int) -> tuple[list[int], list[int]]:
-        """Which episodes to train on, and which to validate on; see
-        :class:`~flowlab.data.training_settings.DataSettings`."""
-        train, held = [], []
-        for task in self.tasks:
-            of_task = [k for k, e in enumerate(self.episodes) if e.task == task]
-            last = len(of_task) - min(held_out, len(of_task) // 3)
-            train += of_task[:last][:demonstrations]
-            held += of_task[last:]
-        return train, held
-
 
 def load_buffer(source: TrainingSource, fallback: Path, pictures: Sequence[str] = ()) -> ReplayBuffer:
     """The demonstrations of a source, decoded into the user's cache folder.

@@ -10,7 +10,7 @@ from flowlab.array_files import load_arrays
 from flowlab.errors import DataError, MissingFileError
 from flowlab.geometry.camera import pose_fault
 from flowlab.geometry.transforms import apply
-from flowlab.recordings.metadata import TRUE_TRACKS
+from flowlab.recordings.recording_yaml import TRUE_TRACKS
 from flowlab.records import Role
 from flowlab.text import cut, natural_key, shown
 from flowlab.untrusted import read_json

@@ -14,7 +14,8 @@ from flowlab.pipeline.labeling import recording_stage
 from flowlab.pipeline.recipe import Recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.stages.observe import ObserverStage
-from flowlab.pipeline.stages.recording import QualityStage, TrackStage
+from flowlab.pipeline.stages.quality import QualityStage
+from flowlab.pipeline.stages.recording import TrackStage
 from flowlab.recordings.description import RecordingDescription, describe_parsed
 from flowlab.recordings.parsing import parse_recording
 from flowlab.recordings.preview import RecordingPreview, preview_recording

@@ -17,8 +17,8 @@ from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler
 from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.recordings.identity import difference, identity
-from flowlab.recordings.metadata import FILE_NAME, load_metadata
 from flowlab.recordings.recording import RecordingSettings, find_recordings
+from flowlab.recordings.recording_yaml import FILE_NAME, load_metadata
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt, read_receipts

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64
 from flowlab.config import SettingsError
 from flowlab.errors import DataError, FlowlabError, UsageError, first_line
 from flowlab.recordings.foreign import foreign_format
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.stamps import IN_SECONDS, Timing, UnclearStamps
 from flowlab.recordings.verdicts import Check
 from flowlab.registry import READERS, Plugin

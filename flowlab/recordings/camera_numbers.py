@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Num
 
 from flowlab.recordings.intrinsics import focal_lengths
-from flowlab.recordings.metadata import FILE_NAME, Metadata
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata
 from flowlab.recordings.unused_files import robot_numbers
 from flowlab.text import cut
 

@@ -80,14 +80,27 @@ def _check_commas(path: Path, lines: Sequence[str], rows: Sequence[list[str]]) -
                         "the numbers with a decimal point, or separate them by ';'")  # fmt: skip
     integers = [row for row in rows if all(re.fullmatch(r"[+-]?\d+", x) for x in row)]
     named = [row for row in rows if not any(map(is_number, row))]
-    if not integers or len(integers) + len(named) < len(rows) or not _are_halves(integers):
+    halves = [row for row in rows if _has_exponents(row)]
+    if not halves:
+        if not integers or len(integers) + len(named) < len(rows) or not _are_halves(integers):
+            return
+        halves = integers
+    if any(len(row) == len(halves[0]) for row in named):  # every cell has a name
         return
-    if any(len(row) == len(integers[0]) for row in named):  # every cell has a name
-        return
-    whole, part = next((row for row in integers if int(row[1])), integers[0])[:2]
+    whole, part = next((row for row in halves if not row[1].isdecimal() or int(row[1])), halves[0])[:2]
     raise DataError(f"{path}: the cells {whole} and {part} may be one number, {whole}.{part}, with a decimal comma: every "  # noqa: E501
                     "second cell is written as what follows one; write the numbers with a decimal point, or separate "
                     "them by ';'")  # fmt: skip
+
+
+def _has_exponents(row: Sequence[str]) -> bool:
+    """Whether exponents stand behind every second cell alone, as in ``1,25e-1``: no one writes 25e-1 for 2.5."""
+    parts = re.compile(r"\d+([eE][+-]?\d+)?")
+    return (
+        all(re.fullmatch(r"[+-]?\d+", x) for x in row[::2])
+        and all(parts.fullmatch(x) for x in row[1::2])
+        and any(not x.isdecimal() for x in row[1::2])
+    )
 
 
 def _are_halves(rows: Sequence[list[str]]) -> bool:

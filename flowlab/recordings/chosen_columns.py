@@ -8,7 +8,7 @@ from typing import Any
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream, Streams
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.text import cut, shown
 
 

@@ -10,10 +10,10 @@ from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.dates import check_no_dates
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.numbering import check_numbers
 from flowlab.recordings.record_times import choose_clock, was_set_back
-from flowlab.recordings.stamps import SECONDS, Timing, UnclearStamps, Unit, decide_sample_unit, decide_unit
+from flowlab.recordings.recording_yaml import Metadata
+from flowlab.recordings.stamps import SECONDS, Timing, UnclearStamps, Unit, decide_sample_unit, decide_unit, kept_every
 from flowlab.recordings.sync import find_gaps, sampling_rate
 from flowlab.recordings.verdicts import Check, Verdict
 
@@ -87,7 +87,7 @@ def put_on_one_clock(streams: Streams, known: Metadata) -> Streams:
     )
     if all(check.verdict is not Verdict.REFUSED for check in checks):
         _check_overlap(timed)
-    said = Check("clock", *_clock_words(streams, units, known))
+    said = Check("clock", *_clock_words(replace(streams, color=color, depth=depth), units, known))
     return replace(timed, checks=(*streams.checks, said, *checks, *_step_checks(timed)))
 
 
@@ -217,6 +217,11 @@ def _clock_words(streams: Streams, units: Sequence[str], known: Metadata) -> tup
         if unit != "frames" and stream.timing.unit is None:
             how = "as 'time_unit' says" if known.time_unit else "by how they step and where they begin"
             verdict = verdict if unit == "s" or known.time_unit else Verdict.ASSUMED
+        every = kept_every(stream.time_s) if unit == "frames" else 1
+        if every > 1 and known.time_unit is None:
+            rate = (known.fps or 1.0) / every
+            how += f", of which every {every}th was kept, {rate:.3g} a second ('time_unit' says what else they may be)"
+            verdict = Verdict.ASSUMED
         found.append(f"{name}: {stream.timing.source} are {_called(unit)}, {how}")
     offsets = {key: getattr(known, key) for key in ("depth_offset_s", "state_offset_s", "T_world_cam_offset_s")}
     found += (f"'{key}: {value:g}' is added" for key, value in offsets.items() if value)

@@ -26,8 +26,10 @@ _SENSED_M = (0.15, 10.0)
 _MOST = 0.9
 """So many of the readings must lie there."""
 _SATURATED = 65535
-_VARIED = 50
+_VARIED = 8
 """So many different readings tell the step between them."""
+_COARSE_M = 0.02
+"""No depth camera has steps as wide as that at all distances [m]."""
 
 
 def likely_unit(median_counts: float) -> str:
@@ -114,6 +116,8 @@ def _judged(unit: float, readings: _Readings, custom: bool) -> tuple[Verdict, st
     if not custom:
         if not _SENSED_M[0] < median < _SENSED_M[1]:
             return Verdict.DOUBTFUL, f", {'near' if median < 1 else 'far'} for a depth camera"
+        if unit * readings.step >= _COARSE_M:
+            return Verdict.DOUBTFUL, ", coarser than depth cameras are: depth was rounded, or the unit is smaller"
         return Verdict.OK, ""
     if not likely or high > 2 * _SENSED_M[1]:
         return Verdict.REFUSED, ", which is not a robot's workspace, and no file says that unit"

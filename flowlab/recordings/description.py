@@ -11,8 +11,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import channel_names
 from flowlab.recordings.frame_check import BadFrame
 from flowlab.recordings.frame_processing import Size
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.parsing import ParsedRecording, RecordingSettings, parse_recording
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.sync import find_gaps, sampling_rate
 from flowlab.recordings.verdicts import Check, raise_refused
 

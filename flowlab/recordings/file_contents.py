@@ -73,6 +73,8 @@ def file_contents(path: Path) -> Contents:
 
 def _of_array(values: np.ndarray, name: str) -> Contents:
     shape = f"{values.dtype} {cut(str(values.shape))}"
+    if values.dtype.kind == "U" and 0 < values.nbytes <= _MOST_READ:
+        return Contents(f"text: {cut(repr(str(values.flat[0])[:60]))}", leaves=((name, str(values.flat[0])),))
     if values.dtype.kind not in "biuf" or values.nbytes > _MOST_READ:
         return Contents(shape)
     leaves = ((name, values.item()),) if values.size == 1 else ()
@@ -119,6 +121,8 @@ def _of_mapping(values: Any, text: str) -> Contents:
         try:
             return _of_array(np.array(values, np.float64), "")
         except (ValueError, TypeError):
+            if values and all(isinstance(x, str) for x in values):
+                return Contents(f"text: {cut(repr(values[0][:60]))}", leaves=(("", values[0]),), words=text[:_HEAD])
             values = values[0] if values and isinstance(values[0], dict) else {}
     if not isinstance(values, dict) or not values:
         return Contents(f"{cut(repr(values))}", words=text[:_HEAD])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from flowlab.errors import DataError
 from flowlab.recordings.dates import dates_in_names
 from flowlab.recordings.stamps import EPOCH_S, SECONDS, Timing, UnclearStamps
 from flowlab.text import shown
@@ -31,6 +32,7 @@ def read_names(files: Sequence[Path], source: str) -> tuple[list[Path], Float64[
     Raises:
         UnclearStamps: There is no such number, or several that change.
     """
+    _check_twins(files, source)
     dates = dates_in_names([f.stem for f in files])
     texts = dates or _changing(files, source)
     _check_fractions(texts, source)
@@ -40,6 +42,16 @@ def read_names(files: Sequence[Path], source: str) -> tuple[list[Path], Float64[
     if dates is not None:
         return [files[i] for i in order], values[order], Timing(f"the dates and times in {source}", "s", names=True)
     return [files[i] for i in order], values[order], Timing(source, unit=None, integers=integers, names=True)
+
+
+def _check_twins(files: Sequence[Path], source: str) -> None:
+    """Refuse two pictures of one name, as a folder has that was converted: which is meant is not said."""
+    known: dict[str, Path] = {}
+    for file in files:
+        if (twin := known.setdefault(file.stem, file)) is not file:
+            raise DataError(
+                f"{source}: {shown(twin.name)} and {shown(file.name)} are two pictures of one name; keep one of each"
+            )
 
 
 def _changing(files: Sequence[Path], source: str) -> list[str]:

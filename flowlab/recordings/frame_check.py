@@ -11,6 +11,7 @@ from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, motion_checks, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
+from flowlab.recordings.pose_steps import check_steps
 from flowlab.recordings.poses import check_known, poses_at
 from flowlab.recordings.repeats import find_repeats
 from flowlab.recordings.sync import nearest_sample
@@ -18,6 +19,8 @@ from flowlab.recordings.verdicts import Check
 
 _NEAR = 0.55
 """So many intervals away a sample may be that is the nearest of a stream without a loss."""
+_ROUNDING_S = 1e-6
+"""Times are sums of floating point: what lies just at a limit is within it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +96,8 @@ def check_frames(
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
-    max_sync_s = min(max_sync_s, _half(streams.color))
-    max_state = {s.name: min(max_state_s, max(_half(streams.color), _half(s))) for s in streams.state}
+    max_sync_s = min(max_sync_s, _half(streams.color)) + _ROUNDING_S
+    max_state = {s.name: min(max_state_s, max(_half(streams.color), _half(s))) + _ROUNDING_S for s in streams.state}
     match = nearest_sample(clock, streams.depth.time_s)
     off = np.abs(streams.depth.time_s[match] - clock)
     off_state = {s.name: np.abs(s.time_s[nearest_sample(clock, s.time_s)] - clock) for s in streams.state}
@@ -137,7 +140,8 @@ def check_frames(
     T_world_cam = None
     if streams.poses is not None and poses is not None:
         T_world_cam, _ = poses_at(streams.poses, streams.color.time_s[rows[:, 0]], pose_gap_s)
-        checks += (check_known(streams.poses, poses[1], pose_gap_s),)
+        shown = tuple(streams.color.names[i] for i in rows[:, 0])
+        checks += (check_known(streams.poses, poses[1], pose_gap_s), check_steps(T_world_cam, shown))
     median = depth[int(rows[0, 1])].median if len(rows) else 0.0
     sync = {"depth": off, **off_state}
     samples = tuple(_samples([(int(i), int(j)) for i, j in rows], color, depth))

@@ -14,7 +14,7 @@ from flowlab.recordings.camera_check import check_camera
 from flowlab.recordings.depth_unit_check import likely_unit
 from flowlab.recordings.intrinsics import Intrinsics
 from flowlab.recordings.lens import undistortion_maps
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.registration import Registration
 from flowlab.recordings.verdicts import Verdict
 

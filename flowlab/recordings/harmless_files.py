@@ -12,6 +12,17 @@ _PROSE = re.compile(
 )
 _SUMS = re.compile(r"(md5|sha\d*)_?(sums?)?(\.txt)?|checksums?(\.txt)?|.*\.(md5|sha\d+)", re.DOTALL)
 _PREVIEW = re.compile(r"(^|[_\-. ])(thumb(nail)?s?|previews?|screenshots?|snapshots?)($|[_\-. \d])")
+_CODE = re.compile(
+    r".*\.(py|ipynb|sh|bash|bat|cpp|cc|h|hpp|c|m|js|lock)|requirements[\w.-]*\.txt|environment\.ya?ml|(docker|make)file"
+    r"|pyproject\.toml|cmakelists\.txt",
+    re.DOTALL,
+)
+_TELLING = re.compile(
+    r"\b(f[xy]|c[xy]|pp[xy]|k\d?|d|fps|hz|rate|calib\w*|intrin\w*|extrin\w*|dist\w*|focal|camera|depth|scale|unit|offset|"
+    r"pose|qpos|joints?|timestamps?|stamps?|times?|matrix|rotation|translation|quat\w*|serial|width|height)\b\s*[:=,]",
+    re.IGNORECASE,
+)
+"""Words before a colon or an equals sign, in a text that is no prose."""
 _FILMS = (".mp4", ".avi", ".mov", ".webm", ".gif")
 _COUNTS = re.compile(r"(next_?)?(rewards?|dones?|terminals?|terminated|truncated|returns?|discounts?|success(es)?)")
 """What learning by reward keeps for every step: neither of the robot's body nor of the camera."""
@@ -39,15 +50,22 @@ def why_harmless(name: str, path: Path | None) -> str | None:
         return "checksums"
     if file.name.endswith("~"):
         return "a copy that an editor left"
+    if _CODE.fullmatch(file.name):
+        return "code"
     if suffix in _FILMS or (suffix in COLOR_SUFFIXES and any(map(_PREVIEW.search, (*file.parts[:-1], file.stem)))):
         return "to look at"
-    return "text without a number" if suffix in (".txt", ".log") and _is_without_numbers(path, suffix) else None
+    return "prose" if suffix in (".txt", ".log") and _is_prose(path, suffix) else None
 
 
-def _is_without_numbers(path: Path, suffix: str) -> bool:
-    """Whether a text holds no digit, that of a log but for the times at the start of its lines."""
+def _is_prose(path: Path, suffix: str) -> bool:
+    """Whether a text is for people to read: it names no reading, and has more words than numbers in every line.
+
+    In a log the times at the start of its lines do not count.
+    """
     try:
         text = read_text(path, _MOST_READ)
     except DataError:
         return False
-    return re.search(r"\d", _LINE_TIME.sub("", text) if suffix == ".log" else text) is None
+    lines = [line.split() for line in (_LINE_TIME.sub("", text) if suffix == ".log" else text).splitlines()]
+    numbers = [sum(any(c.isdigit() for c in word) for word in line) for line in lines]
+    return not _TELLING.search(text) and all(2 * n <= len(line) for n, line in zip(numbers, lines, strict=True))

@@ -17,8 +17,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import choose_reader
 from flowlab.recordings.folder_files import FoundFile, files_below
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from flowlab.recordings.metadata import FILE_NAME
 from flowlab.recordings.parsing import RecordingSettings, known_beforehand
+from flowlab.recordings.recording_yaml import FILE_NAME
 
 _PART = 4096
 """Bytes of each part of a large file."""

@@ -8,6 +8,7 @@ from jaxtyping import Num
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from flowlab.config import Settings, SettingsError
+from flowlab.limits import MAX_PIXELS
 from flowlab.recordings.lens import Lens, lens_of
 from flowlab.text import shown
 
@@ -53,9 +54,9 @@ class Intrinsics(FiniteSettings):
     """[px]"""
     cy: float
     """[px]"""
-    width: int | None = Field(default=None, gt=0)
+    width: int | None = Field(default=None, gt=0, le=MAX_PIXELS)
     """Of the pictures that the numbers belong to [px]."""
-    height: int | None = Field(default=None, gt=0)
+    height: int | None = Field(default=None, gt=0, le=MAX_PIXELS)
     """[px]"""
     distortion: Annotated[tuple[float, ...], AfterValidator(_coefficients)] = ()
     """Coefficients in the order of the model; the pictures are undistorted where there are any."""

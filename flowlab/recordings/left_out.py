@@ -10,7 +10,7 @@ import numpy as np
 from flowlab.recordings.file_contents import Contents, array_contents, file_contents
 from flowlab.recordings.folder_files import files_below, no_files_below
 from flowlab.recordings.harmless_files import why_harmless
-from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.recording_yaml import FILE_NAME
 from flowlab.recordings.unused_files import by_folder, is_ignored, matches, quoted, some_of
 from flowlab.recordings.unused_meaning import Unused, ask
 from flowlab.recordings.verdicts import Check, Verdict

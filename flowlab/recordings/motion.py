@@ -47,10 +47,11 @@ def check_motion(pictures: Motion, other: Motion, stated: float | None) -> Check
     about = f"motion of {other.name}"
     found = _offset(pictures, other)
     if found is None:
-        return Check(about, Verdict.OK, "too little motion to tell an offset from color")
+        return Check(about, Verdict.ASSUMED, "too little motion to tell an offset from color, so it is taken as none")
     offset_s, like, margin, step_s = found
     if like < _LIKE:
-        return Check(about, Verdict.OK, f"not like that of color (correlation {like:.2f}), so it tells no offset")
+        says = f"not like that of color (correlation {like:.2f}), so it tells no offset, which is taken as none"
+        return Check(about, Verdict.ASSUMED, says)
     if margin < _MARGIN or abs(offset_s) < 0.75 * step_s:
         return Check(about, Verdict.OK, f"goes with that of color (correlation {like:.2f})")
     when = "after" if offset_s > 0 else "before"

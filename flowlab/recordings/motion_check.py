@@ -37,6 +37,8 @@ _FEW, _MORE = 0.25, 1.5
 _HALF = 0.5
 """Where, in the median, fewer stood, that may be a gripper before a camera on a wrist."""
 _FIFTH = 5
+_PASSING = 0.2
+"""What passes before a camera that stands fills at most this share of the pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,12 @@ def check_motion(source: "ParsedRecording") -> Check:
     moving = [(a, m) for a, m in told if m.camera_moves]
     if not moving:
         return _as_fixed([m for _, m in told], len(pairs), len(samples))
+    since_the_first = [m.camera_moves for _, m in pairs[len(samples) - 1 :]]
+    stays = since_the_first[-1:] == [False] and True not in since_the_first
+    if stays and len(moving) < _PASSING * len(told):
+        return Check("camera", Verdict.ASSUMED, f"it is taken as fixed: between {len(moving)} of {len(told)} pairs of "
+                     "pictures most of what is seen moves, as where something large passes, but later pictures show "
+                     "it where the first has it")  # fmt: skip
     steps = [m.px * a.color_factor for a, m in moving]
     mean = np.mean([m.move / (m.move + m.stand) for _, m in moving])
     a = moving[int(np.argmax(steps))][0]

@@ -18,8 +18,8 @@ from flowlab.recordings.chosen_columns import with_chosen_columns
 from flowlab.recordings.clock import put_on_one_clock
 from flowlab.recordings.frame_check import FrameCheck, align_samples, check_frames
 from flowlab.recordings.frame_processing import FrameProcessor, make_frame_processor
-from flowlab.recordings.metadata import FILE_NAME, Metadata, combine, load_metadata
 from flowlab.recordings.poses import ABOUT, load_poses, most_apart_s
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata, combine, load_metadata
 from flowlab.recordings.sample_files import load_samples
 from flowlab.recordings.saturation import without_saturated
 from flowlab.recordings.stamps import UnclearStamps

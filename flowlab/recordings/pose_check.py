@@ -13,6 +13,7 @@ from flowlab.geometry.transforms import apply, rigid
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.frame_processing import FrameProcessor
 from flowlab.recordings.pose_readings import READINGS
+from flowlab.recordings.pose_steps import come_again
 from flowlab.recordings.poses import poses_at
 from flowlab.recordings.verdicts import Check, Verdict
 
@@ -37,14 +38,22 @@ _EDGE = 0.05
 """Depth that differs by this share beside a pixel has an edge there."""
 _FLOOR = (0.004, 0.01)
 """What sensors and flow err by: a length [m], and a share of the distance."""
+_OF_PIXEL = 0.3
+"""And a share of a pixel of the small pictures that are compared."""
+_NO_BETTER = 0.9
+"""Poses that leave more than this share explain nothing."""
 _EXPLAINED = 0.5
 """Right poses leave less than this share of how far the scene moves before the camera."""
 _BETTER = 0.5
 """Another reading of the poses is the right one where it leaves less than this share of what they leave."""
 _SHIFTED = 0.6
 """The same, of poses at other times."""
+_MOST = 0.75
+"""In so many of the pairs."""
 _SHIFT_M = 0.003
 """And by no less than this [m]."""
+_REFITS = 4
+"""Times that a rigid motion is fitted to the half of the points that fit best."""
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
 _READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     **READINGS,
@@ -61,8 +70,26 @@ class _Pair:
     second: Float64[np.ndarray, "N 3"]
     px: float
     """How far they move in the picture, in the median [px]."""
+    pixel_rad: float
+    """What a pixel of the small pictures spans [rad]."""
     width: int
     """Of the picture [px]."""
+
+    @property
+    def pixel_m(self) -> Float64[np.ndarray, "N"]:
+        """How wide a pixel is at every point, by how far apart points are that are as far apart in the picture [m]."""
+        return self.first[:, 2] * self.pixel_rad
+
+    def is_rigid(self, off_m: float) -> bool:
+        """Whether some rigid motion takes most points to within so much; if none does, they were not found again."""
+        inside = np.ones(len(self.first), bool)
+        for _ in range(_REFITS):
+            a, b = self.first[inside], self.second[inside]
+            U, _, Vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+            R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+            left = np.linalg.norm((self.first - a.mean(0)) @ R.T + b.mean(0) - self.second, axis=1)
+            inside = left <= np.median(left)
+        return bool(np.median(left) < off_m)
 
     def off_m(self, T: Float[np.ndarray, "T 4 4"]) -> float:
         """How far apart they are in the world, in the median."""
@@ -74,7 +101,7 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     """Whether the scene stands still under the poses, and whether it does so only by another reading of them."""
     T = source.frame_check.T_world_cam
     assert T is not None
-    pairs = list(_pairs(source))
+    pairs = [pair for pair in _pairs(source) if pair.is_rigid(_floor_m([pair]))]
     if not pairs:
         says = "it moves as its poses say; too little texture and depth in the pictures to tell whether these are right"
         return Check("camera", Verdict.ASSUMED, says)
@@ -85,21 +112,31 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     return Check("camera", verdict, f"it moves{says}: {seen}" if verdict is Verdict.OK else f"{seen}{says}")
 
 
+def _floor_m(pairs: list[_Pair]) -> float:
+    """What sensors and flow err by [m]."""
+    far, pixel = (float(np.median([np.median(x) for x in of])) for of in
+                  ([p.first[:, 2] for p in pairs], [p.pixel_m for p in pairs]))  # fmt: skip
+    return _FLOOR[0] + _FLOOR[1] * far + _OF_PIXEL * pixel
+
+
 def _judged(source: "ParsedRecording", pairs: list[_Pair], off: float, fixed: float) -> tuple[Verdict, str]:
     """What follows from how far apart points are under the poses, and would be without [m]."""
     T = source.frame_check.T_world_cam
     assert T is not None
-    floor = _FLOOR[0] + _FLOOR[1] * float(np.median([np.median(p.first[:, 2]) for p in pairs]))
-    late, best = _best_offset(source, pairs)
-    if best < min(_SHIFTED * off, floor) and off - best > _SHIFT_M:
+    floor = _floor_m(pairs)
+    late, best, unshifted = _best_offset(source, pairs)
+    if best < min(_SHIFTED * unshifted, floor) and unshifted - best > _SHIFT_M and not come_again(T):
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)
         return Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, (
             f", within {1000 * best:.1f} mm if {late:g} s were added to the times of the poses: their clocks differ; "
             f"write 'T_world_cam_offset_s: {write:.3g}' into {source.write_to}")  # fmt: skip
-    if off <= floor and (off <= _EXPLAINED * fixed or fixed <= 2 * floor):
-        return Verdict.OK, " little" if fixed <= 2 * floor else ""
     others = {how: _off_m(pairs, read(T)) for how, read in _READINGS.items()}
     how = min(others, key=lambda k: others[k])
+    little = fixed <= 2 * floor
+    if off <= floor and (off <= _EXPLAINED * fixed or (little and (fixed <= floor / 2 or off <= _NO_BETTER * fixed))):
+        told = off <= _EXPLAINED * fixed or fixed <= floor / 2
+        return (Verdict.OK, " little" if little else "") if told else (Verdict.ASSUMED, (
+            ": that is too little to tell whether the poses are right"))  # fmt: skip
     if others[how] < min(_BETTER * off, _EXPLAINED * fixed):
         return Verdict.REFUSED, (
             f", within {1000 * others[how]:.1f} mm if each were {how}: T_world_cam must map coordinates of the camera "
@@ -116,18 +153,23 @@ def _off_m(pairs: list[_Pair], T: Float[np.ndarray, "T 4 4"]) -> float:
     return float(np.mean([p.off_m(T) for p in pairs]))
 
 
-def _best_offset(source: "ParsedRecording", pairs: list[_Pair]) -> tuple[float, float]:
-    """What added to the times of the poses [s] has the scene stay best, and within what [m]."""
+def _best_offset(source: "ParsedRecording", pairs: list[_Pair]) -> tuple[float, float, float]:
+    """What added to the times of the poses [s] has the scene stay best, within what, and within what as it is [m].
+
+    Both are of the pairs that have poses at the other times, and most of these must fit better.
+    """
     poses, clock = source.streams.poses, source.streams.color.time_s[source.frame_check.color]
     assert poses is not None
+    here, _ = poses_at(poses, clock, np.inf)
     found = []
     for late in _OFFSETS_S:
         T, known = poses_at(poses, clock - late, np.inf)
         mine = [p for p in pairs if known[list(p.rows)].all()]
-        if 2 * len(mine) >= len(pairs):
-            found.append((_off_m(mine, T), late))
-    best, late = min(found, default=(np.inf, 0.0))
-    return late, best
+        better = sum(p.off_m(T) < p.off_m(here) for p in mine)
+        if 2 * len(mine) >= len(pairs) and better >= _MOST * len(mine):
+            found.append((_off_m(mine, T), late, _off_m(mine, here)))
+    best, late, unshifted = min(found, default=(np.inf, 0.0, np.inf))
+    return late, best, unshifted
 
 
 def _pairs(source: "ParsedRecording") -> Iterator[_Pair]:
@@ -206,7 +248,13 @@ def _matched(flow: "cv2.DISOpticalFlow", rows: tuple[int, int], one: _Taken, oth
     if good.sum() < _ENOUGH * good.size:
         return None
     px = float(np.median(np.linalg.norm(there[good], axis=-1)))
-    return _Pair(rows, points_a[good], second[good], px, a.shape[1])
+    return _Pair(rows, points_a[good], second[good], px, _pixel_rad(points_a), a.shape[1])
+
+
+def _pixel_rad(points: np.ndarray) -> float:
+    """What a pixel spans in the middle of a picture, by the rays of its points [rad]."""
+    across = np.diff(points[..., 0] / points[..., 2], axis=1)
+    return float(np.nanmedian(across))
 
 
 def _around(z: np.ndarray) -> np.ndarray:

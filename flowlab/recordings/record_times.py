@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 
@@ -77,7 +78,27 @@ def was_set_back(stamps: Float64[np.ndarray, "N"], recorded_s: Float64[np.ndarra
     lag = recorded_s - stamps
     back = np.flatnonzero(np.diff(stamps) < 0)
     usual = float(np.median(np.diff(np.sort(stamps))))
-    return any(_shift(lag, int(i)) > 0.5 * max(usual, 1e-9) and len(lag) - i > 2 for i in back)
+    least = 0.5 * max(usual, 1e-9)
+    for_good = any(_shift(lag, int(i)) > least and len(lag) - i > 2 for i in back)
+    return for_good or any(abs(size) > least for size, _, _ in _set_and_reset(lag, recorded_s, least))
+
+
+def _set_and_reset(
+    lag: Float64[np.ndarray, "N"], recorded_s: Float64[np.ndarray, "N"], least_s: float
+) -> Iterator[tuple[float, int, int]]:
+    """By how much a clock was set for a while, and the last message before, and the last of these.
+
+    Messages that are overtaken, or wait in a queue, are not late by the same amount one after the other.
+    """
+    usual = float(np.median(np.diff(recorded_s))) if len(lag) > 1 else 0.0
+    even = np.abs(np.diff(recorded_s) - usual) < 0.5 * np.maximum(np.abs(np.diff(lag)), 1e-9)
+    jumps = np.flatnonzero((np.abs(np.diff(lag)) > least_s) & even)
+    varies = float(np.subtract(*np.quantile(lag, (0.75, 0.25)))) if len(lag) else 0.0
+    for i, j in pairwise(jumps.tolist()):
+        there, back, meanwhile = lag[i + 1] - lag[i], lag[j + 1] - lag[j], lag[i + 1 : j + 1]
+        unusual = len(meanwhile) > 1 and abs(np.median(meanwhile) - np.median(lag)) > abs(there) / 2
+        if unusual and max(abs(there + back), np.ptp(meanwhile), varies) < _EVEN * abs(there):
+            yield float(there), i, j
 
 
 def _lag(stamps: Float64[np.ndarray, "N"], timing: Timing) -> Float64[np.ndarray, "N"] | None:
@@ -112,7 +133,13 @@ def _set(streams: Stamped, lags: Mapping[str, Float64[np.ndarray, "N"]]) -> Iter
         jumped = np.flatnonzero(_stamps_jump(lag, recorded_s))
         sizes = [(abs(_shift(lag, int(i))), int(i)) for i in jumped if _is_steady(lag, int(i))]
         size, at = max(sizes, default=(0.0, 0))
-        if size > DOUBTFUL_S:
+        for_a_while = [found for found in _set_and_reset(lag, recorded_s, DOUBTFUL_S) if abs(found[0]) > size]
+        if for_a_while:
+            by, start, stop = max(for_a_while, key=lambda found: abs(found[0]))
+            way = "back" if by > 0 else "forward"
+            yield _Fault(abs(by), f"the clock of {name} was set {way} by {_ms(abs(by))} for the entries {start + 2} to "
+                         f"{stop + 1}: the stamps jump there, the times of recording do not")  # fmt: skip
+        elif size > DOUBTFUL_S:
             way = "back" if _shift(lag, at) > 0 else "forward"
             yield _Fault(size, f"the clock of {name} was set {way} by {_ms(size)} at entry {at + 2}: the stamps jump "
                          "there, the times of recording do not")  # fmt: skip

@@ -34,6 +34,8 @@ _GAIN = (0.12, 0.35)
 """Likewise, it is this much better than where depth lies."""
 _LIES = 0.25
 """Where edges of depth lie on those of color, these are as strong, in standard deviations of the picture."""
+_STRAIGHT, _TURNED = 0.6, 1.5
+"""Where they are as strong as that, depth is not turned; else it is where they are so many times as strong turned."""
 _CLEAR, _CLEAR_SHARE = 40.0, 0.03
 """A gradient of a smoothed picture, by Sobel, is no noise beyond this; so many pixels have one, or all is dim."""
 _SHARE = (0.012, 0.03)
@@ -152,6 +154,27 @@ def _scores(pairs: Sequence[tuple[np.ndarray, np.ndarray]], scale: float, reach:
     return total / len(pairs)
 
 
+_TURNS: dict[str, tuple[slice, slice]] = {
+    "upside down": (slice(None, None, -1), slice(None)),
+    "mirrored": (slice(None), slice(None, None, -1)),
+    "turned by half a turn": (slice(None, None, -1), slice(None, None, -1)),
+}
+
+
+def _fits_turned(samples: Sequence[PictureSample], straight: Misalignment | None) -> str:
+    """How depth lies if its edges lie on those of color only when it is turned or mirrored; empty where it does not."""
+    if straight is None or straight.here >= _STRAIGHT or not straight.textured:
+        return ""
+    for how, turn in _TURNS.items():
+        turned = estimate_misalignment([replace(s, depth=s.depth[turn]) for s in samples])
+        if turned is None or turned.here < max(_STRAIGHT, _TURNED * straight.here) or turned.clarity < _CLARITY[0]:
+            continue
+        if turned.gain <= _GAIN[0] or turned.share <= _SHARE[0]:
+            return (f", but edges of depth lie on those of color as if depth were {how} ({turned.here:.2f} standard "
+                    f"deviations above the mean, {straight.here:.2f} as it is)")  # fmt: skip
+    return ""
+
+
 def check_registration(source: "ParsedRecording") -> Check:
     """Whether depth lies on color, by what is said of it and by the pictures."""
     how, stated = _how(source)
@@ -167,6 +190,8 @@ def check_registration(source: "ParsedRecording") -> Check:
                      f"{source.write_to}")  # fmt: skip
     found = estimate_misalignment(samples)
     verdict, says = _judged(found, stated)
+    if verdict is not Verdict.OK and (how_turned := _fits_turned(samples, found)):
+        verdict, says = max(verdict, Verdict.DOUBTFUL, key=lambda v: v.severity), how_turned
     if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL) or (turned and verdict is not Verdict.OK):
         advice = "give 'depth_intrinsics' and 'T_color_depth', or record depth that is aligned to color: see"
         if source.metadata.T_color_depth is not None:

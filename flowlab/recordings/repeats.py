@@ -1,15 +1,16 @@
 """Pictures that come again while time goes on: a camera that froze, or one that is slower than its recorder."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, Num
+from jaxtyping import Bool, Float64, Int64, Num
 
 from flowlab.recordings.base import ImageStream, Streams
-from flowlab.recordings.content import PictureDigest, change_between, is_equal
+from flowlab.recordings.content import PictureDigest, change_between, has_noise, is_equal, runs
+from flowlab.recordings.stale import encoded_anew, older_pictures, repeated_parts
 from flowlab.recordings.verdicts import Check, Verdict
 
 _RUN = 3
@@ -24,10 +25,6 @@ _OVER_NOISE = 1.5
 """Pictures with noise show motion where they change by this many times what is usual."""
 _NOISY = (0.3, 0.7)
 """Noise changes this share of the pixels from picture to picture, in this share of the pairs."""
-_UNLIKE = -0.2
-"""Correlation of two changes in a row: near -0.5 for noise, as what was added is gone again, above for motion."""
-_OF_CONTRAST = 0.35
-"""Noise is less than this share of the contrast; a change of this size is motion."""
 _ALL_OVER = 0.5
 """A camera that moves changes this share of the pixels."""
 _AT_ONCE = 0.5
@@ -60,7 +57,7 @@ class _Pictures:
     def noisy(self) -> bool:
         """Whether no two pictures are the same, however still the scene is."""
         new = np.concatenate([[True], ~self.equal])
-        return _has_noise(np.array([k.small.ravel() for k in self.kept], np.float32)[new])
+        return has_noise(np.array([k.small.ravel() for k in self.kept], np.float32)[new])
 
     @cached_property
     def same(self) -> Bool[np.ndarray, "N"]:
@@ -101,7 +98,7 @@ class _Pictures:
     def cadence(self) -> float | None:
         """Rows for each new picture, where these come steadily but more rarely than rows; None where not."""
         every = np.diff(np.flatnonzero(np.concatenate([[True], ~self.same])))
-        if len(_runs(self.same)) < _STEADY[1]:
+        if len(runs(self.same)) < _STEADY[1]:
             return None
         steady = every[np.isin(every, np.floor(every.mean()) + np.arange(2))]
         slower = len(steady) >= _STEADY[0] * len(every) and steady.mean() >= _SLOWER
@@ -146,7 +143,7 @@ def find_repeats(
     still: set[int] = set()
     at_once: set[int] = set()
     for one, other in (seen, seen[::-1]):
-        for first, last in _runs(one.same):
+        for first, last in runs(one.same):
             proven = one.froze(first, last) or other.moved(first, last) or _robot_moved(state, first, last)
             again = range(first + 1, last + 1)
             if proven and (last - first + 1 >= _RUN or one.cadence is not None):
@@ -156,9 +153,35 @@ def find_repeats(
                 named.update({k: one.name(k) for k in again})
             else:
                 (at_once if one.stopped_at_once(first, last) else still).update(again)
+    doubts: list[str] = []
+    for name, one, other in zip(("color", "depth"), seen, seen[::-1], strict=True):
+        older = older_pictures(one.kept, one.noisy, one.change)
+        whose = "" if one is seen[0] else "its depth picture "
+        bad |= {k: f"{whose}equals {one.name(k0)} bit by bit, and others lie between: an older picture came again"
+                for k, k0 in older.items() if k not in bad}  # fmt: skip
+        doubts += _stale(name, one, other, {*older, *(np.flatnonzero(one.same) + 1).tolist()})
     return bad, _check(
-        bad, {k: n for k, n in named.items() if k not in bad}, still - {*bad, *named, *at_once}, at_once - {*bad}, seen
-    )
+        bad, {k: n for k, n in named.items() if k not in bad}, still - {*bad, *named, *at_once}, at_once - {*bad},
+        doubts, seen,
+    )  # fmt: skip
+
+
+def _stale(name: str, pictures: _Pictures, other: _Pictures, told: set[int]) -> Iterator[str]:
+    """What is doubtful of the pictures of a stream that have noise, and are not the same as a whole."""
+    skip = np.isin(np.arange(len(pictures.kept)), list(told))
+    parts = repeated_parts(pictures.kept, skip) if pictures.noisy else {}
+    if parts:
+        share = float(np.median(list(parts.values())))
+        yield (f"in {len(parts)} {name} pictures, from {pictures.name(min(parts))} on, {share:.0%} of each is "
+               "that of an earlier one bit by bit, though it has noise: a part froze, or buffers tore")  # fmt: skip
+        return
+    again = [
+        run for run in encoded_anew(pictures.kept, other.kept) if not told.issuperset(range(run[0] + 1, run[1] + 1))
+    ]
+    if again:
+        first, last = pictures.name(again[0][0]), pictures.name(again[-1][1])
+        yield (f"{name} changes from {first} to {last} by far less than the noise of the other pictures: one may have "
+               "been encoded again and again")  # fmt: skip
 
 
 def _check(
@@ -166,6 +189,7 @@ def _check(
     named: Mapping[int, str],
     still: set[int],
     at_once: set[int],
+    doubts: Sequence[str],
     seen: tuple[_Pictures, _Pictures],
 ) -> Check:
     """What came of looking for repeats."""
@@ -183,7 +207,8 @@ def _check(
     slow = [p for p in seen if p.cadence is not None]
     for name, p in zip(("color", "depth"), seen, strict=True):
         says += f"; {name}: {_slower(p)}" if p.cadence is not None else ""
-    many = bool(bad) or bool(slow) or bool(at_once) or len(named) > _MANY * rows
+    says = "; ".join([says, *doubts])
+    many = bool(bad) or bool(slow) or bool(at_once) or bool(doubts) or len(named) > _MANY * rows
     return Check("repeats", Verdict.DOUBTFUL if many else Verdict.ASSUMED if still or named else Verdict.OK, says)
 
 
@@ -204,25 +229,6 @@ def _slower(pictures: _Pictures) -> str:
     if abs(every - round(every)) < 1 / len(pictures.kept):
         return f"{rate}; '--set recording.every={round(every)}' takes each once"
     return f"{rate}; '--set recording.max_bad_share={1 - 1 / every + 0.05:.2f}' leaves out those that come again"
-
-
-def _has_noise(pictures: Float32[np.ndarray, "T P"]) -> bool:
-    """Whether pictures differ from one to the next as by a sensor's noise, not by motion alone."""
-    steps = np.diff(pictures, axis=0)
-    differ = steps != 0
-    if len(pictures) < _FEWEST or (differ.mean(axis=1) >= _NOISY[0]).mean() < _NOISY[1]:
-        return False
-    size = float(np.median(np.abs(steps[differ])))
-    contrast = float(np.median([np.std(p[p != 0]) if p.any() else 0.0 for p in pictures]))
-    capped = np.clip(steps, -3 * size, 3 * size)
-    like = [float(np.sum(a * b) / max(np.sqrt(np.sum(a**2) * np.sum(b**2)), 1e-9)) for a, b in pairwise(capped)]
-    return bool(np.median(like) < _UNLIKE and size < _OF_CONTRAST * contrast)
-
-
-def _runs(same: Bool[np.ndarray, "N"]) -> list[tuple[int, int]]:
-    """First and last row of every run of equal pictures."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _robot_moved(state: Num[np.ndarray, "T S"], first: int, last: int) -> bool:

@@ -27,6 +27,12 @@ _VARY = 0.3
 """So many readings change from one picture to the next where a sensor takes them."""
 _OTHERS = 0.4
 """So many of the readings must be others, or it is a plane before which a thing moves."""
+_NEAR_TYPES_LIMIT = (35, 0.75)
+"""Readings of 16 bits this near to the greatest stand for none, too, where none lies from this share of it on."""
+_FILLED = (0.05, 10.0)
+"""One reading of this share, so many times as frequent as any other, fills holes among readings with noise."""
+_ROUGH = 5e-4
+"""Noise is more than this share of the depth."""
 _STEADY = 0.2
 """A limit changes in so many times as few pixels as other readings."""
 
@@ -36,14 +42,21 @@ def without_saturated(streams: Streams) -> Streams:
     depth = streams.depth
     pairs = _pairs(depth)
     pictures = [picture for pair in pairs for picture in pair]
-    limits = _limits(pairs)
-    masked = replace(depth, read=partial(_read_masked, depth.read, limits))
+    limits = (*_limits(pairs), *_near_types_limit(pictures))
+    filled = [found for p in pictures if (found := _filled(p, ())) is not None]
+    fills = len(filled) >= max(2, min(_RUN, len(pictures))) and len({value for value, _ in filled}) > 1
+    masked = replace(depth, read=partial(_read_masked, depth.read, limits, fills))
     says = [
         f"{value:g} counts are taken as no reading: {_place(pictures, value)}, in {share:.1%} of the pixels"
         for value in sorted({*limits, *_types_limits(pictures)})
         if (share := float(np.mean([(p == value).mean() for p in pictures])))
     ]
-    verdict = Verdict.ASSUMED if says else Verdict.OK
+    if fills:
+        share = np.median([share for _, share in filled])
+        says.append(f"in {len(filled)} of {len(pictures)} pictures {share:.0%} of the pixels have one reading, another "
+                    "one from picture to picture, among others with noise, as of a filter that fills holes; these "
+                    "are taken as no reading")  # fmt: skip
+    verdict = Verdict.DOUBTFUL if fills else Verdict.ASSUMED if says else Verdict.OK
     check = Check("saturated depth", verdict, "; ".join(says) or "no reading is that of a limit")
     return replace(streams, depth=masked, checks=(*streams.checks, check))
 
@@ -78,6 +91,45 @@ def _types_limits(pictures: Sequence[np.ndarray]) -> set[float]:
 
 def _types_limit(dtype: np.dtype) -> float | None:
     return float(np.iinfo(dtype).max) if dtype.kind in "iu" and dtype.itemsize == 2 else None
+
+
+def _near_types_limit(pictures: Sequence[np.ndarray]) -> tuple[float, ...]:
+    """Codes at the end of a type, such as negative numbers that were stored without a sign."""
+    codes: set[float] = set()
+    for picture in pictures:
+        most = _types_limit(picture.dtype)
+        if most is None:
+            continue
+        high = np.unique(picture[picture > _NEAR_TYPES_LIMIT[1] * most])
+        if high.size and high[0] < most - _NEAR_TYPES_LIMIT[0]:
+            return ()
+        codes.update(np.arange(most - _NEAR_TYPES_LIMIT[0], most).tolist() if (high < most).any() else ())
+    return tuple(sorted(codes))
+
+
+def _filled(counts: np.ndarray, limits: Sequence[float]) -> tuple[float, float] | None:
+    """The reading with which holes of a picture were filled, and its share of the pixels; None where there is none."""
+    none = np.array([*limits, _types_limit(counts.dtype) or 0])
+    valid = np.isfinite(counts) & (counts > 0) & ~np.isin(counts, none)
+    values, times = np.unique(counts[valid], return_counts=True)
+    if len(values) < 2 or times.max() < _FILLED[0] * valid.sum():
+        return None
+    value = values[times.argmax()]
+    others = valid & (counts != value)
+    fills = (
+        others.sum() >= _OTHERS * valid.sum()
+        and _is_rough(counts, others)
+        and times.max() >= _FILLED[1] * np.sort(times)[-2]
+    )
+    return (float(value), float(times.max() / counts.size)) if fills else None
+
+
+def _is_rough(counts: np.ndarray, valid: np.ndarray) -> bool:
+    """Whether readings have noise: most lie off the line through their neighbors, by more than they are rounded."""
+    depth = counts.astype(np.float64)
+    off = np.abs(depth[:, 2:] - 2 * depth[:, 1:-1] + depth[:, :-2])[valid[:, 2:] & valid[:, 1:-1] & valid[:, :-2]]
+    least = max(2.0 if counts.dtype.kind in "iu" else 0.0, _ROUGH * float(np.median(depth[valid])))
+    return off.size > 0 and bool((off >= least).mean() > 0.5)
 
 
 def _limits(pairs: Sequence[Sequence[np.ndarray]]) -> tuple[float, ...]:
@@ -116,10 +168,12 @@ def _steady(pair: Sequence[np.ndarray], valid: np.ndarray, values: np.ndarray) -
     return {float(v) for v in values if changes[pair[0] == v].mean() <= _STEADY * vary}
 
 
-def _read_masked(read: Callable[[int], np.ndarray], limits: Sequence[float], index: int) -> np.ndarray:
+def _read_masked(read: Callable[[int], np.ndarray], limits: Sequence[float], fills: bool, index: int) -> np.ndarray:
     """Decode a depth picture; readings that are none are 0."""
     counts = read(index)
     own = _types_limit(counts.dtype)
     none = [*limits, *([] if own is None else [own])]
+    filled = _filled(counts, none) if fills and counts.ndim == 2 else None
+    none += [] if filled is None else [filled[0]]
     found = np.isin(counts, np.array(none, counts.dtype)) if none else np.zeros(0, bool)
     return np.where(found, 0, counts) if found.any() else counts

@@ -26,6 +26,8 @@ _SAME = 0.02
 """Steps that are all whole multiples of one may be numbers of kept frames, unless a unit gives the rate as exactly."""
 SAMPLE_STEP_S = (1 / 4000, 10.0)
 """What may lie between two samples of a robot [s]."""
+_HUNDREDTHS = 100
+"""A second has so many of them, which some write; at 60 pictures they step by 1 and 2, as a counter may."""
 LARGEST_COUNT = 10
 """Numbers of frames of which at most every so many-th was kept; what steps farther counts something else."""
 RATE_TOLERANCE = 0.25
@@ -82,7 +84,7 @@ def decide_unit(
     else:
         unit = epoch_unit(stamps) or _by_step(stamps, timing, fps)
     if unit != "frames":
-        _check_step(step, unit, timing, PICTURE_STEP_S)
+        _check_step(stamps, unit, timing)
         _check_rate(step, unit, timing, fps)
     return unit
 
@@ -118,7 +120,7 @@ def _units(step: float, bounds: tuple[float, float]) -> list[Unit]:
 def _by_step(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None) -> Unit | Literal["frames"]:
     """The unit in which a step is plausible, and agrees with ``fps``."""
     step = _step(stamps)
-    numbers = timing.integers and not step > LARGEST_COUNT
+    numbers = timing.integers and not step > LARGEST_COUNT and _count_frames(stamps, fps)
     units: list[Unit | Literal["frames"]] = [
         u for u in _units(step, PICTURE_STEP_S) if np.max(np.abs(stamps)) * SECONDS[u] <= _LONGEST_S
     ]
@@ -138,6 +140,25 @@ def _by_step(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None
     raise UnclearStamps(_unclear(stamps, timing, fps, units))
 
 
+def _count_frames(stamps: Float64[np.ndarray, "N"], fps: float | None) -> bool:
+    """Whether steps are those of a counter: from one to the next, or all multiples of the least.
+
+    Hundredths of a second step by 3, 3, 4 at 30 pictures a second; where every third is kept no step is 4.
+    """
+    steps = np.diff(stamps)
+    least = steps[steps > 0].min(initial=np.inf)
+    hundredths = fps is not None and steps.mean() > 1 + _SAME and _agree(_HUNDREDTHS / steps.mean(), fps, _SAME)
+    even = bool(np.all(steps % least == 0))
+    return even if least > 1 else not (hundredths and steps.max() <= least + 1)
+
+
+def kept_every(stamps: Float64[np.ndarray, "N"]) -> int:
+    """Of how many numbers of frames one was kept, by the usual step; 1 where they go on one by one."""
+    steps = np.diff(stamps)
+    steps = steps[steps > 0]
+    return int(steps.min()) if len(steps) else 1
+
+
 def _is_usual(step: float, unit: str) -> bool:
     """Whether pictures are taken so often that nothing but the unit is needed to believe it."""
     return unit in _USUAL_STEP_S and step * SECONDS[unit] <= _USUAL_STEP_S[unit]
@@ -153,7 +174,10 @@ def _unclear(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None
     step = _step(stamps)
     found = f"{timing.source} step by {step:g}{'' if fps is None else f' where fps is {fps:g}'}"
     rates = ["numbers of frames"] if "frames" in units else []
-    if fps is not None and timing.integers and not rates and step <= PICTURE_STEP_S[1] * fps:
+    steps = np.diff(stamps)
+    if fps is not None and timing.integers and not rates and step <= LARGEST_COUNT:
+        rates = [f"times in ticks, as steps from {steps.min():g} to {steps.max():g} are no whole number of frames"]
+    elif fps is not None and timing.integers and not rates and step <= PICTURE_STEP_S[1] * fps:
         rates = [f"numbers of frames, of which every {step:g}th was kept ({fps / step:.3g} pictures a second)"]
     kept = bool(rates) and fps is not None
     rates += [f"{u} ({1 / (step * SECONDS[u]):.3g} pictures a second)" for u in units if u != "frames"]
@@ -165,18 +189,18 @@ def _unclear(stamps: Float64[np.ndarray, "N"], timing: Timing, fps: float | None
     return f"when the pictures were taken is not known: {found} and may be {' or '.join(rates)}{ticks}; {write}"
 
 
-def _check_step(step: float, unit: str, timing: Timing, bounds: tuple[float, float]) -> None:
+def _check_step(stamps: Float64[np.ndarray, "N"], unit: str, timing: Timing) -> None:
     """Refuse a step that no camera has."""
+    step, least, most = _step(stamps), *PICTURE_STEP_S
     took = step * SECONDS[unit]
-    if np.isfinite(took) and not bounds[0] * 0.999 <= took <= bounds[1]:
-        likely = [u for u in _units(step, bounds) if u != unit and _is_usual(step, u)]
-        write = (
-            f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s"
-            if likely
-            else _write(1, False)
-        )
+    if np.isfinite(took) and not least * 0.999 <= took <= most:
+        likely = [u for u in _units(step, PICTURE_STEP_S) if u != unit and _is_usual(step, u)]
+        likely = [u for u in likely if np.max(np.abs(stamps)) * SECONDS[u] <= _LONGEST_S]
+        write = "they may be digits of a date, or ticks: give 'times', a file with the seconds of every picture"
+        if likely:
+            write = f"'time_unit: {likely[0]}' would make that {step * SECONDS[likely[0]]:.3g} s"
         raise UnclearStamps(
-            f"{timing.source} step by {took:.3g} s if they are in {unit}, expected {bounds[0]:.2g} to {bounds[1]:g} s "
+            f"{timing.source} step by {took:.3g} s if they are in {unit}, expected {least:.2g} to {most:g} s "
             f"between pictures; {write}"
         )
 

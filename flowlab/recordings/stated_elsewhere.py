@@ -15,6 +15,15 @@ if TYPE_CHECKING:
 _RATE = re.compile(r"(^|[._])(\w*_)?(fps|hz|frame_?rate|rate|frequency)$")
 _UNIT = re.compile(r"(^|[._])\w*(depth\w*_?(scale|unit|factor)(_m)?|unit_m)$")
 _WIDTH = re.compile(r"(^|[._])(image_?|color_?)?(width|height|w|h)$")
+_COUNT = re.compile(
+    r"(^|[._])((num|n|nr|number_of|total)_?(frames?|images?|pictures?|steps?|samples?)|(frames?|steps?)_?(count|num)|length)$"
+)
+_LABEL = re.compile(
+    r"(^|[._])(\w*_)?(episode|trial|take|demo|task|seed|version|serial|user|operator|subject|session|id|index)"
+    r"(_?(id|ids|index|idx|number|num|no|nr))?$"
+)
+_STEP = re.compile(r"(^|_)(time)?(step|frame)s?(_?(index|id|idx|number|no))?$")
+"""What a number with such a name counts is neither a place nor a time."""
 _TELLS = re.compile(r"fps|rate|hz|unit|scale|time|stamp|frame|pose|cam|convention|axes|model|lens|dist|matrix|coord")
 """What has one of these in its name may matter, though it is a text."""
 _SAME = 0.02
@@ -25,6 +34,8 @@ def states_what_is_used(source: "ParsedRecording", name: str, contents: Contents
     if contents.leaves:
         return all(_is_used(source, key, value) for key, value in contents.leaves)
     values = contents.values
+    if values is not None and values.ndim == 1 and values.dtype.kind in "iu" and len(np.unique(np.diff(values))) == 1:
+        return _LABEL.search(name.lower()) is not None or _STEP.search(name.lower()) is not None
     return values is not None and values.size > 0 and values.ndim <= 3 and _is_used_array(source, name, values)
 
 
@@ -44,6 +55,8 @@ def _stated(source: "ParsedRecording", key: str, value: Any) -> float | None:
         return None
     if _RATE.search(key.lower()):
         return sampling_rate(source.streams.color.time_s)
+    if _COUNT.search(key.lower()):
+        return float(len(source.streams.color))
     unit = source.metadata.depth_unit_m
     if _UNIT.search(key.lower()) and unit is not None:
         return 1 / unit if value > 1 else unit
@@ -54,6 +67,8 @@ def _stated(source: "ParsedRecording", key: str, value: Any) -> float | None:
 
 def _is_used(source: "ParsedRecording", key: str, value: Any) -> bool:
     """Whether a number is the one that is used, or a text has no name that may matter."""
+    if isinstance(value, int) and _LABEL.search(key.lower()):
+        return True
     used = _stated(source, key, value)
     if used is not None:
         return _alike(value, used)

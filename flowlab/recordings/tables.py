@@ -91,6 +91,8 @@ def _numbers(path: Path, names: list[str], cells: list[tuple[int, list[str]]], l
     integers = all(x.lstrip("+-").isdecimal() for _, row in cells for x in row)
     words = {k: tuple(row[k].strip() for _, row in cells) for k in text}
     called = tuple(n.strip() for n in names)
+    if twice := next((n for k, n in enumerate(called) if n and n in called[:k]), ""):
+        raise DataError(f"{path}: has two columns {shown(twice)}; give each a name of its own")
     return SampleTable(path, called, np.array(rows, np.float64), frozenset(text), integers, words)
 
 

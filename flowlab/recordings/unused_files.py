@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 
-from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.recording_yaml import FILE_NAME
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 

@@ -11,8 +11,8 @@ import numpy as np
 from flowlab.errors import FlowlabError
 from flowlab.recordings.camera_numbers import called_poses, camera_numbers
 from flowlab.recordings.file_contents import Contents
-from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.poses import read_poses
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata
 from flowlab.recordings.stated_elsewhere import contradictions, states_what_is_used
 from flowlab.recordings.tables import read_table
 from flowlab.recordings.unused_files import quoted, robot_numbers

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from flowlab.recordings.file_contents import Contents
-from flowlab.recordings.metadata import FILE_NAME
+from flowlab.recordings.recording_yaml import FILE_NAME
 from flowlab.recordings.stamps import SECONDS
 from flowlab.text import cut
 

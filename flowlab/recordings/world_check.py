@@ -75,9 +75,20 @@ def check_world(source: "ParsedRecording") -> Iterator[Check]:
     plane = _dominant_plane(_cloud(source))
     judged = _judged(T, plane, stands, source.write_to)
     if poses is not None and judged.verdict is not Verdict.OK:  # the world of tracked cameras has any axes
-        yield Check("world", Verdict.ASSUMED, f"at first {stands}; no level plane tells which way is up")
+        yield Check("world", Verdict.ASSUMED, f"at first {stands}; {_any_axes(T, plane)}")
         return
     yield judged
+
+
+def _any_axes(T: np.ndarray, plane: _Plane | None) -> str:
+    """How the world of a tracked camera lies, which may have any axes."""
+    if plane is None:
+        return "no plane in the cloud tells which way is up"
+    if _tilt(T, plane) > 180 - _LEVEL_DEG:
+        return (f"the plane with {plane.share:.0%} of the points is seen from below, so the world's z axis may point "
+                "down")  # fmt: skip
+    return (f"the plane with {plane.share:.0%} of the points is tilted by {_tilt(T, plane):.0f} degrees against the "
+            "world's xy-plane, so it may be a wall, or the world has another up")  # fmt: skip
 
 
 def _baseline(far: float, write_to: str) -> Iterator[Check]:

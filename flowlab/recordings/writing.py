@@ -13,7 +13,7 @@ from flowlab.errors import DataError, UsageError
 from flowlab.files import new_folder
 from flowlab.geometry.camera import Camera, pose_fault
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME, TRUE_TRACKS
+from flowlab.recordings.recording_yaml import FILE_NAME, TRUE_TRACKS
 
 _POSES = "T_world_cam.npy"
 _MAX_COUNT = np.iinfo(np.uint16).max

@@ -24,8 +24,8 @@ from flowlab.recordings import verdicts
 from flowlab.recordings.base import BadImage, ImageStream, Reader, SampleStream, Streams, load_readers
 from flowlab.recordings.clock import put_on_one_clock
 from flowlab.recordings.image_files import COLOR_SUFFIXES, check_depth
-from flowlab.recordings.metadata import FILE_NAME, combine
 from flowlab.recordings.parsing import RecordingSettings, known_beforehand
+from flowlab.recordings.recording_yaml import FILE_NAME, combine
 from flowlab.recordings.stamps import UnclearStamps
 from flowlab.testing.promises import content, elsewhere, require, require_words
 

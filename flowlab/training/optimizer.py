@@ -1,6 +1,6 @@
-"""How weights change: AdamW for each group, a learning rate that rises and falls, a moving average."""
+"""How weights change: AdamW for each group, and a learning rate that rises and falls; its settings are in
+:mod:`flowlab.data.training_settings`."""
 
-import copy
 import math
 from collections.abc import Iterator, Mapping
 
@@ -61,17 +61,3 @@ class Optimizers:
             for group in optimizer.param_groups:
                 for p in group["params"]:
                     yield self._names[id(p)], (optimizer, p), optimizer.state[p]
-
-
-class EMA:
-    """Exponential moving average of a policy's weights: what is validated, kept and used."""
-
-    def __init__(self, policy: PolicyNetwork, settings: OptimizerSettings) -> None:
-        self.policy = copy.deepcopy(policy).requires_grad_(False).eval()
-        self._settings = settings
-        self._averaged: list[Tensor] = list(self.policy.parameters())
-
-    def update(self, policy: PolicyNetwork, step: int) -> None:
-        """Take in the weights after a step."""
-        decay = min(1 - (1 + step) ** -self._settings.ema_power, self._settings.ema_max)
-        torch._foreach_lerp_(self._averaged, [p.detach() for p in policy.parameters()], 1 - decay)

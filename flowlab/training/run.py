@@ -17,29 +17,27 @@ from flowlab.data.channels import infer_channels
 from flowlab.data.normalizer import fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.split import split_episodes
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.checkpoint import (
-    POLICY,
-    RUN,
     TrainedPolicy,
-    build_policy,
     check_observer,
     load_policy,
     read_trained,
     writing_run,
 )
-from flowlab.policies.run_folder import RunConfig, has_begun, read_resume, read_run_config
-from flowlab.registry import POLICIES, names_from_file
+from flowlab.policies.run_folder import RunConfig, has_begun, read_run_config
+from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.loggers import check_loggers, make_logger
 from flowlab.training.metrics import MetricsFile
 from flowlab.training.precision import Precision
+from flowlab.training.resume import resume_run
 from flowlab.training.trainer import Trainer, TrainingProgress
-from flowlab.untrusted import is_there
 
 _UNTIMED, _TIMED = 3, 12
 """Steps made to learn how long one takes."""
@@ -110,7 +108,7 @@ def prepare_run(
     processes.part(settings.batch.windows)
     source = open_training_source(data)
     buffer = load_buffer(source, out, settings.needs.pictures)
-    train, held_out = buffer.split(settings.data.demonstrations, settings.data.held_out)
+    train, held_out = split_episodes(buffer.episodes, settings.data)
     if overfit is not None:
         train = held_out = list(range(min(overfit, len(buffer.episodes))))
     policy = _new_policy(source, buffer, settings, began_from)
@@ -146,54 +144,6 @@ def _check_same(out: Path, settings: TrainSettings, overfit: int | None, began_f
             f"{out}: holds a run already, which began in another way; choose another --out, or go on with it by "
             f"'flowlab train {out} --resume':\n  " + "\n  ".join(lines)
         )
-
-
-def resume_run(
-    folder: Path,
-    data: Path | None = None,
-    *,
-    device: str | None = None,
-    threads: int | None = None,
-    precision: Precision | None = None,
-    logs: Sequence[str] | None = None,
-) -> Trainer:
-    """A run that ended early, as it was after the last step that was saved; it computes on what it did, but for what
-    is given. ``data`` is where its dataset is, if it has moved.
-
-    Raises:
-        DataError: The dataset is no longer what the run began with, or there is nothing to resume.
-    """
-    trained, began = read_trained(folder), read_run_config(folder)
-    given = {
-        "dataset": None if data is None else data.resolve(),
-        "device": device,
-        "threads": threads,
-        "precision": precision,
-        "logs": None if logs is None else (*logs,),
-    }
-    config = began.model_copy(update={k: v for k, v in given.items() if v is not None})
-    with names_from_file(but=logs or ()):
-        check_loggers(config.logs)
-    processes = ProcessGroup(config.device, config.threads, config.precision)
-    if not is_there(config.dataset):
-        raise DataError(
-            f"{folder}: its dataset is no longer at {config.dataset}; restore it, or change 'dataset' in {folder / RUN}"
-        )
-    source = open_training_source(config.dataset)
-    check_observer(trained, folder, source)
-    if source.fingerprint != trained.fingerprint:
-        raise DataError(
-            f"{folder}: began with content {trained.fingerprint} of {config.dataset}, now {source.fingerprint}; "
-            "restore the dataset, or start a new run"
-        )
-    step, groups = read_resume(folder)
-    buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
-    policy = build_policy(
-        trained.policy, groups.get("policy", {}), f"{folder}: its resume file does not fit its {POLICY}"
-    )
-    trainer = Trainer(folder, config, policy, buffer, processes)
-    trainer.load_state(step, groups)
-    return trainer
 
 
 def run(

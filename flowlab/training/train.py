@@ -15,7 +15,8 @@ from flowlab.storage.dataset import Dataset
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import METRICS, last_metrics
 from flowlab.training.precision import Precision
-from flowlab.training.run import ComputeSettings, begin_run, resume_run, run
+from flowlab.training.resume import resume_run
+from flowlab.training.run import ComputeSettings, begin_run, run
 from flowlab.training.trainer import Trainer, TrainingProgress
 
 CURVE = "curve.png"

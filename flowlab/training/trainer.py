@@ -17,8 +17,9 @@ from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import TrainedPolicy, save_weights, writing_run
 from flowlab.policies.run_folder import Groups, RunConfig, lines_behind, save_resume, start_folder
 from flowlab.training.distributed import ProcessGroup
+from flowlab.training.ema import EMA
 from flowlab.training.metrics import MetricsFile, RunningMeans
-from flowlab.training.optimizer import EMA, Optimizers
+from flowlab.training.optimizer import Optimizers
 from flowlab.training.validation import validate
 
 _STEPS_PER_LINE = 50

@@ -21,7 +21,7 @@ class Followed(LucasKanade):
 """
 READER = """
 from dataclasses import replace
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.readers.plain import PlainReader
 
 class BoxReader(PlainReader):

@@ -19,6 +19,8 @@ from synthetic import files_below, make_dataset, make_episode, with_quality
 from flowlab.checksums import with_checksum
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.split import split_episodes
+from flowlab.data.training_settings import DataSettings
 from flowlab.data.windows import Windows
 from flowlab.errors import DataError
 from flowlab.records import Episode
@@ -347,7 +349,8 @@ def test_the_last_of_each_task_are_held_out(
 ) -> None:
     """Six of one task, three of the next, one of the last: two thirds of each, rounded up, remain at least."""
     buffer = random_buffer([("a", 3)] * 6 + [("b", 3)] * 3 + [("c", 3)], points=1, queries=1)
-    assert buffer.split(demonstrations, held_out) == (train, held)
+    settings = DataSettings(demonstrations=demonstrations, held_out=held_out)
+    assert split_episodes(buffer.episodes, settings) == (train, held)
 
 
 def pictured(seed: int, *, rgb: bool = True) -> Episode:

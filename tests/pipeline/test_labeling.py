@@ -19,7 +19,8 @@ from flowlab.pipeline.inspection import estimate_cost, inspect_recordings
 from flowlab.pipeline.labeling import find_jobs, label_recordings
 from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
-from flowlab.pipeline.stages.recording import LiftStage, QualityStage, TrackStage
+from flowlab.pipeline.stages.quality import QualityStage
+from flowlab.pipeline.stages.recording import LiftStage, TrackStage
 from flowlab.pipeline.units import WorkUnit
 from flowlab.records import Episode, PositionSource
 from flowlab.storage.dataset import Dataset

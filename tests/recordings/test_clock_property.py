@@ -14,7 +14,7 @@ from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.clock import put_on_one_clock
 from flowlab.recordings.file_stamps import read_names
 from flowlab.recordings.frame_check import align_samples, check_frames
-from flowlab.recordings.metadata import Metadata
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.stamps import SECONDS, Timing, UnclearStamps
 from flowlab.recordings.sync import nearest_sample
 from flowlab.recordings.verdicts import Verdict

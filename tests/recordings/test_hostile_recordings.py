@@ -26,9 +26,9 @@ from test_rh20t_reader import GRIPPER, MS, SERIAL, TCP, write_calibration, write
 from flowlab.errors import DataError
 from flowlab.recordings.base import BadImage, ImageStream, Streams, read_streams
 from flowlab.recordings.image_files import decode_color, decode_depth
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_limits import limited_memory, unpack
 from flowlab.recordings.readers.safe_pickle import pickled_numbers
+from flowlab.recordings.recording_yaml import Metadata
 from tests.thoroughness import examples
 
 Spoil = Callable[[Path], Any]

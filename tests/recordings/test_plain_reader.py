@@ -1,6 +1,7 @@
 """The plain folder: written and read back, and what others write that looks like it."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +235,14 @@ def test_names_without_numbers_are_never_paired_by_order(tmp_path: Path) -> None
     assert_frames(opened(write_folder(path, steps=0, times="t.txt", fps=None)), [0, 1, 2])
     (path / "depth" / "b.png").rename(path / "depth" / "d.png")
     with pytest.raises(DataError, match="the depth pictures are not named as those are"):
+        opened(path)
+
+
+def test_two_pictures_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = write_folder(tmp_path / "r", steps=3)
+    first = sorted((path / "color").iterdir())[0]
+    shutil.copy(first, first.with_suffix(".jpg"))
+    with pytest.raises(DataError, match=r"the names in color/: '0.*' and '0.*' are two pictures of one name; keep one"):
         opened(path)
 
 

@@ -251,6 +251,30 @@ def test_poses_that_are_not_the_cameras_are_refused(
     assert code == (3 if verdict == "refused" else 0), problem
 
 
+def moved(rows: slice | list[int], by: float) -> np.ndarray:
+    T = POSES.copy()
+    T[rows, 0, 3] += by
+    return T
+
+
+@pytest.mark.parametrize(
+    ("T", "verdict", "words"),
+    [
+        (POSES, "ok", "no pose leaps"),
+        (moved([9], 0.2), "doubtful", "1 poses leap away and back, at color/"),
+        (moved([6, 7], -0.15), "doubtful", "2 poses leap away and back, at color/"),
+        (np.repeat(POSES[::2], 2, axis=0)[: len(POSES)], "doubtful", "equal the one before"),
+    ],
+)
+def test_single_poses_that_cannot_be_are_doubtful(
+    frames: Frames, tmp_path: Path, capsys: Capture, T: np.ndarray, verdict: str, words: str
+) -> None:
+    _, found, _, _ = looked_at(capsys, put(tmp_path / "r", frames, T))
+    assert found["steps of poses"][0] == verdict
+    assert words in found["steps of poses"][1]
+    assert "added to the times" not in found["camera"][1]
+
+
 @pytest.mark.parametrize(("read", "code", "verdict"), [(lambda T: T, 0, "ok"), (inverse, 3, "refused")])
 def test_poses_of_a_slow_camera_are_tested_over_longer(
     tmp_path: Path, capsys: Capture, read: Callable[[np.ndarray], np.ndarray], code: int, verdict: str

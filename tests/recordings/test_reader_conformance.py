@@ -12,13 +12,13 @@ import pytest
 from real_recordings import INTRINSICS, STEPS, colors, counts, write_folder, write_png, write_yaml
 
 from flowlab.recordings.base import BadImage, ImageStream, Reader, Streams
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.arrays import ArraysReader
 from flowlab.recordings.readers.plain import PlainReader
 from flowlab.recordings.readers.realsense import RealSenseReader
 from flowlab.recordings.readers.rh20t import RH20TReader
 from flowlab.recordings.readers.ros import ROSReader
 from flowlab.recordings.readers.tum import TUMReader
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.testing.readers import CHECKS, MakeReader, check_reader, check_recognized
 
 

@@ -13,10 +13,10 @@ from test_ros_reader import Messages, Say, instant, say_camera, write_bag
 from test_situations_meaning import Capture, looked_at
 
 from flowlab.recordings.depth_unit_check import likely_unit
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_camera_info import rectified
 from flowlab.recordings.readers.ros_topics import of_two_cameras
 from flowlab.recordings.readers.tum import TUMReader
+from flowlab.recordings.recording_yaml import Metadata
 
 BENT = [0.3, -0.1, 0.0, 0.0, 0.0]
 POSES = np.array([looking((0.3 - 0.02 * t, -0.9, 0.7)) for t in range(STEPS)])

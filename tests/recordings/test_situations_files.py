@@ -83,6 +83,9 @@ UNKNOWN = {
     "blob.bin": (b"\0\0", "bytes of an unknown format"),
     "old.h5": (b"x", "it is HDF5"),
     "color/0003.png.part": (b"x", "ignore: "),
+    "count.json": ({"num_frames": 7}, "it says num_frames 7, and 6 is used"),
+    "numbers.txt": ("take 1 2 3 4 5\n", "text: "),
+    "setup.txt": ("the camera was moved, fx: 120 px in this take of the day\n", "'intrinsics'"),
     "IMG 7.png": (b"x", r"ignore: \['IMG 7.png'\]"),
 }
 """Files beside a plain recording: none may pass as ok."""
@@ -121,7 +124,10 @@ def test_what_is_known_to_be_harmless_is_listed(tmp_path: Path, capsys: Capture)
         "preview_3.png": b"x", "run.log": "2023-11-14 12:00:01,123 INFO started\n", "task.txt": "pour the beans",
         "md5sums.txt": "0123", "state.npy~": b"x", "reward.npy": CLOCK,
         "about.json": {"operator": "x", "fps": 10.0, "image_width": 32, "camera": {"K": K.tolist()}},
-        "K.npy": K, "frame_times.txt": CLOCK + 77,
+        "K.npy": K, "frame_times.txt": CLOCK + 77, "notes.txt": "Take 3 of 5, 2023-11-14, cup 2 cm left\nlooks good",
+        "meta.json": {"task": "pour", "episode": 12, "success": True, "num_frames": STEPS, "serial_number": "0433"},
+        "language.json": ["pour the beans", "put them back"], "instruction.npy": np.array("pour"),
+        "record.py": "fx = 3", "environment.yml": "dependencies: [numpy=1.26]", "requirements.txt": "numpy==1.26",
     }  # fmt: skip
     for name, content in harmless.items():
         put(folder, name, content)
@@ -195,6 +201,7 @@ def test_files_of_rh20t_and_of_tum_are_known(tmp_path: Path, capsys: Capture) ->
                 _there(folder / f"{kind}/{t}.png")
             )
         put(folder, f"{kind}.txt", "".join(f"{1.7e9 + t / 10:.6f} {kind}/{t}.png\n" for t in range(STEPS)))
+    put(folder, "depth/99.png", (folder / "depth/0.png").read_bytes())
     put(folder, "accelerometer.txt", lines(np.c_[CLOCK, ROWS[:, :3]], " "))
     put(folder, "recording.yaml", "depth_unit_m: 0.001\nintrinsics: {fx: 30, fy: 31, cx: 15.2, cy: 11.7}\n")
     _, checks, _ = looked_at(capsys, folder)

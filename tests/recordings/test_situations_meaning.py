@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from dry_runs import dry_run
 from real_recordings import INTRINSICS, STEPS, colors, counts, write_folder, write_yaml
 from test_ros_reader import START_NS, STEP_NS, Messages, Say, instant, say_camera, say_robot_and_camera, write_bag
 
 from flowlab.errors import DataError
 from flowlab.recordings.clock_numbers import find_clocks
-from flowlab.recordings.number_check import find_turns
 from flowlab.recordings.readers.publishers import Who, tell_apart
 from flowlab.recordings.tables import parse_table
+from flowlab.recordings.turns import find_turns
 
 Capture = pytest.CaptureFixture[str]
 Verdicts = dict[str, tuple[str, str]]
@@ -115,6 +116,8 @@ def test_a_simple_motion_is_no_clock() -> None:
         ("x\n0,050\n0,100\n", "one number, 0.050"),
         ("-0,25,1,75\n0,50,1,50\n", "one number, -0.25"),
         ("1,5,2,8\n1,9,3,1\n2,3,3,4\n2,7,3,7\n3,1,4,0\n", "one number, 1.5"),
+        ("1,25e-1,0,20\n1,35e-1,0,21\n", "the cells 1 and 25e-1 may be one number, 1.25e-1"),
+        ("0,5E+1\n1,2\n", r"one number, 0\.5E\+1"),
         ("x;y\n1.200,5;2,5\n1.201,5;2,5\n", r"line 2 has '1\.200,5', with a decimal comma or a sign between thousands"),
         ('x,y\n"0,100","0,250"\n', "line 2 has '0,100', with a decimal comma"),
         ("x,y,z\n1,2\n", "line 2 has 2 cells, expected 3, as many as names: '1,2'"),
@@ -122,6 +125,8 @@ def test_a_simple_motion_is_no_clock() -> None:
         ("0,1,0,1\n1,0,0,1\n0,0,1,1\n", ""),
         ("100,200,300,400\n150,250,310,410\n", ""),
         ("a,b\n1,050\n2,100\n", ""),
+        ("a,b\n1,25e-1\n2,35e-1\n", ""),
+        ("1e3,25e-1\n2e3,35e-1\n", ""),
     ],
 )  # fmt: skip
 def test_commas_within_numbers_are_asked_about(text: str, says: str) -> None:
@@ -182,7 +187,7 @@ def test_two_on_one_topic_are_told_apart_or_refused(
     found, facts, checks = looked_at(capsys, bag)
     assert found == code, facts["problem"]
     if first is None:
-        assert "leaps away and back" in checks["state numbers"][1]
+        assert "leaps between smooth tracks" in checks["state numbers"][1]
     else:
         assert (facts["state_names"][0], facts["state_width"] in (6, 14)) == (first, True)
         assert checks["state numbers"][0] == "ok"
@@ -206,10 +211,48 @@ def test_numbers_of_one_robot_do_not_leap() -> None:
         np.round(0.01 * arm, 2),
     ):
         assert find_turns(values) is None
-    other = arm[::-1] + 0.1
-    for who in (np.arange(200) % 2 > 0, np.arange(200) % 4 > 0, rng.random(200) < 0.3):
+    other = arm[::-1] + 0.4
+    k = np.arange(200)
+    for who in (k % 2 > 0, k % 4 > 0, k // 5 % 2 > 0, rng.random(200) < 0.3):
         assert find_turns(np.where(who[:, None], arm, other)) is not None
+    assert find_turns(np.where((k % 21 == 7)[:, None], arm, 3 + other)) is not None
     assert find_turns(np.where((np.arange(200) % 2 > 0)[:, None], arm, 9 + other)[:, :1]) is not None
+
+
+def rough(kind: str) -> np.ndarray:
+    """Actions of one robot, as rough from row to row as two robots in turn may seem."""
+    rng, k = np.random.default_rng(3), np.arange(61)
+    path = np.sin(0.03 * np.cumsum(np.abs(rng.normal(size=61)))[:, None] * (1 + 0.3 * np.arange(7)) + np.arange(7))
+    keys = np.eye(7)[rng.integers(0, 7, 61)] * rng.choice([-1, 1], (61, 1))
+    tremor = 0.05 * path + 0.02 * np.sin(np.pi / 2 * k)[:, None]
+    held = np.where(
+        (k // 5 % 2 > 0)[:, None], path[0], -path[9] + 0.01 * np.repeat(rng.normal(size=(13, 7)), 5, 0)[:61]
+    )
+    gripper = np.column_stack([path[:, :6], (rng.random(61) < 0.5) + 0.01 * rng.normal(size=61)])
+    noise = rng.normal(size=(61, 7)) * (rng.random((61, 1)) < 0.3)
+    steps = np.diff(path, axis=0, append=0)
+    made = {"differences": steps, "keys": keys, "tremor": tremor, "held": held, "gripper": gripper, "bursts": noise}
+    return made[kind][:60]
+
+
+@pytest.mark.parametrize("kind", ["differences", "keys", "tremor", "held", "gripper", "bursts"])
+def test_rough_actions_of_one_robot_are_its_own(kind: str) -> None:
+    assert find_turns(rough(kind)) is None
+
+
+def test_actions_that_leap_are_asked_about(tmp_path: Path, capsys: Capture) -> None:
+    folder = write_folder(tmp_path / "r", steps=30, action="a.npy")
+    np.save(folder / "a.npy", rough("differences")[:30])
+    code, _, checks = looked_at(capsys, folder)
+    assert (code, checks["action numbers"][0]) == (0, "ok")
+    arm = np.sin(0.1 * np.arange(30)[:, None] + np.arange(7))
+    np.save(folder / "a.npy", arm + 3.0 * (np.arange(30) // 3 % 2)[:, None])
+    code, facts, _ = looked_at(capsys, folder)
+    assert code == 3
+    assert "write 'one_robot: true'" in facts["problem"]
+    write_yaml(folder / "recording.yaml", **yaml.safe_load((folder / "recording.yaml").read_text()), one_robot=True)
+    code, _, checks = looked_at(capsys, folder)
+    assert (code, checks["action numbers"][0]) == (0, "assumed")
 
 
 def test_who_sent_is_told_by_frame_name_or_node() -> None:

@@ -90,6 +90,28 @@ def test_a_camera_clock_set_forward_is_named(
         assert_refused(found, f"the clock of color was set {way}")
 
 
+@pytest.mark.parametrize(
+    ("by_s", "until_s", "word"),
+    [
+        (0.15, 1.3, "step back"),
+        (0.25, 1.2, "step back"),
+        (-0.3, 1.5, "step back"),
+        (0.08, 1.4, "for the entries 11 to 14"),
+    ],
+)
+def test_a_clock_set_for_a_few_messages_is_named(
+    tmp_path: Path, inspect: Inspect, by_s: float, until_s: float, word: str
+) -> None:
+    """Messages that are overtaken are late one by one, these are by the same amount."""
+    clock = lambda t: t - by_s * (0.95 < t < until_s - 0.05)  # noqa: E731
+    found = inspect(write(tmp_path / "r.bag", camera=clock, robot=None))
+    if word == "step back":
+        assert_refused(found, word, "clock: recorded")
+    else:
+        (says,) = (c["says"] for c in found[1]["checks"] if c["about"] == "record times" and c["verdict"] == "doubtful")
+        assert word in says
+
+
 def test_a_small_step_back_of_the_camera_is_doubtful_and_its_own(tmp_path: Path, inspect: Inspect) -> None:
     facts = assert_fine(inspect(write(tmp_path / "r.bag", camera=behind(0.08, since_s=1.5))), doubtful=True)
     (check,) = [c for c in facts["checks"] if c["about"] == "record times"]

@@ -76,6 +76,14 @@ def test_a_standing_camera_is_known_to_stand(still: Frames, tmp_path: Path, caps
     assert said(capsys, tmp_path / "light", "camera", light)[0] == "ok"
 
 
+def test_what_passes_before_a_camera_is_no_motion_of_it(tmp_path: Path, capsys: Capture) -> None:
+    """It fills the picture for some frames, and then the scene is where it was."""
+    large = Box((-1.6, -0.35, 0.4), (0.7, 0.05, 0.7), (150, 90, 60), contrast=90.0)
+    frames = filmed(lambda t: POSE, large, 0.12, 30)
+    verdict, says = said(capsys, tmp_path / "r", "camera", frames)
+    assert verdict in ("assumed", "ok"), says
+
+
 def test_what_pictures_do_not_show_is_assumed(still: Frames, tmp_path: Path, capsys: Capture) -> None:
     rng = np.random.default_rng(0)
     dark = [(rng.normal(rgb * 0.04 + 4, 2).clip(0, 255).astype(np.uint8), depth) for rgb, depth in still]
@@ -118,6 +126,46 @@ def test_one_reading_that_stays_while_others_vary_is_none(
     verdict, says = said(capsys, tmp_path / "r", "saturated depth", change(still[:6]))
     assert verdict == "assumed", says
     assert re.search(words, says), says
+
+
+def patched(frames: Frames, value: Callable[[np.ndarray, int], object]) -> Frames:
+    """A patch of each picture filled anew."""
+    hole = np.zeros(SIZE[::-1], bool)
+    hole[10:40, 10:45] = True
+    return [(rgb, np.where(hole, value(depth, t), depth)) for t, (rgb, depth) in enumerate(frames)]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [lambda d, t: d.max(), lambda d, t: np.quantile(d, 0.4 + 0.03 * t), lambda d, t: 0.9 + 0.01 * t],
+    ids=["greatest", "middle", "another"],
+)
+def test_holes_that_were_filled_are_no_readings(
+    still: Frames, tmp_path: Path, capsys: Capture, value: Callable[[np.ndarray, int], object]
+) -> None:
+    folder = put(tmp_path / "r", patched(still[:6], value), intrinsics=GIVEN, T_world_cam=None)
+    _, found, _ = verdicts(capsys, folder)
+    verdict, says = found["saturated depth"]
+    assert (verdict, "15% of the pixels have one reading" in says) == ("doubtful", True)
+    rng = np.random.default_rng(0)
+    few = patched(still[:6], lambda d, t: np.where(rng.random(d.shape) < 0.1, d.max(), d))
+    assert said(capsys, tmp_path / "few", "saturated depth", few)[0] == "ok"
+
+
+def test_codes_at_the_end_of_16_bits_are_no_readings(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    rng = np.random.default_rng(0)
+    odd = patched(still[:3], lambda d, t: 65.531 + 0.001 * rng.integers(0, 5, d.shape))
+    folder = put(tmp_path / "r", odd, intrinsics=GIVEN, T_world_cam=None)
+    found = verdicts(capsys, folder)[1]
+    assert found["saturated depth"][0] == "assumed"
+    assert "100% within" in found["depth unit"][1]
+
+
+def test_depth_in_wide_steps_is_doubtful(still: Frames, tmp_path: Path, capsys: Capture) -> None:
+    for step, expected in ((0.1, "doubtful"), (0.04, "doubtful"), (0.005, "ok")):
+        wide = [(rgb, np.rint(depth / step) * step) for rgb, depth in still[:3]]
+        verdict, says = said(capsys, tmp_path / f"{step}", "depth unit", wide)
+        assert (verdict, f"in steps of {1000 * step:g} mm" in says) == (expected, True)
 
 
 def test_readings_beyond_what_is_sensed_are_doubtful(still: Frames, tmp_path: Path, capsys: Capture) -> None:
@@ -164,6 +212,25 @@ def test_depth_that_fits_nowhere_is_doubtful(
 ) -> None:
     verdict, says = said(capsys, tmp_path / "r", "registration", [(rgb, change(depth)) for rgb, depth in still[:4]])
     assert verdict in ("doubtful", "refused"), says
+
+
+@pytest.mark.parametrize(
+    ("turn", "how"),
+    [
+        ((slice(None, None, -1), slice(None)), "upside down"),
+        ((slice(None), slice(None, None, -1)), "mirrored"),
+        ((slice(None, None, -1), slice(None, None, -1)), "turned by half a turn"),
+    ],
+)
+@pytest.mark.parametrize("eye", [(0.5, -0.7, 0.6), (-0.4, -0.8, 0.5)])
+def test_depth_that_is_turned_is_told_how(
+    tmp_path: Path, capsys: Capture, turn: tuple[slice, slice], how: str, eye: tuple[float, float, float]
+) -> None:
+    frames = filmed(lambda t: looking(eye), count=3)
+    assert said(capsys, tmp_path / "ok", "registration", frames)[0] == "ok"
+    verdict, says = said(capsys, tmp_path / "r", "registration", [(rgb, depth[turn]) for rgb, depth in frames])
+    assert verdict in ("doubtful", "refused")
+    assert f"as if depth were {how} (" in says
 
 
 def test_pictures_without_edges_tell_nothing_of_registration(still: Frames, tmp_path: Path, capsys: Capture) -> None:

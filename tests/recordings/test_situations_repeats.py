@@ -15,9 +15,9 @@ FRAMES = 40
 INTRINSICS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
 
 
-def film(t: int, noise: float = 2.0, pan: float = 0.0) -> Frame:
+def film(t: int, noise: float = 2.0, pan: float = 0.0, seed: int | None = None) -> Frame:
     """A small block slides over a textured wall, which a camera that pans passes; ``noise`` is the sensor's."""
-    rng = np.random.default_rng(t)
+    rng = np.random.default_rng(t if seed is None else seed)
     wall = cv2.GaussianBlur(np.random.default_rng(99).normal(0, 1, (48, 400)), (0, 0), 1.5) * 90
     shift = round(pan * t)
     gray = np.clip(120 + wall[:, shift : shift + 64], 40, 200)
@@ -47,6 +47,23 @@ def shown(order: Sequence[int], which: str = "both", **how: float) -> list[Frame
 def held(first: int, last: int) -> list[int]:
     """Frame ``first`` until ``last``."""
     return [first if first <= t < last else t for t in range(FRAMES)]
+
+
+def encoded(frames: Sequence[Frame], quality: Sequence[int]) -> list[Frame]:
+    """Color after JPEG, each in a quality of its own."""
+    jpg = [
+        cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, q])[1] for (rgb, _), q in zip(frames, quality, strict=True)
+    ]
+    return [(cv2.imdecode(j, cv2.IMREAD_COLOR), depth) for j, (_, depth) in zip(jpg, frames, strict=True)]
+
+
+def torn(rows: slice, columns: slice = slice(None), which: tuple[int, ...] = (0, 1)) -> list[Frame]:
+    """The film, of which a part stays from frame 16 to 22."""
+    frames = shown(range(FRAMES))
+    for t in range(17, 23):
+        for k in which:
+            frames[t][k][rows, columns] = frames[16][k][rows, columns]
+    return frames
 
 
 FREEZES = [(16, 24, 7), (32, 40, 7), (0, 9, 8), (4, 40, 35)]
@@ -108,7 +125,9 @@ SLOWS_DOWN = [int(t) for t in np.cumsum([0, *[8] * 10, 6, 4, 2, *[0] * 26])]
         lambda: shown([0] * FRAMES, noise=0.0),
         lambda: shown(range(FRAMES), pan=3),
         lambda: shown(SLOWS_DOWN, noise=0.0, pan=0.5),  # a camera that stops
-        lambda: [(film(max(t, 12), 0.0)[0], film(max(t, 12), 2.0)[1] + t % 2) for t in range(FRAMES)],
+        lambda: [(film(max(t, 12), 0.0)[0], film(max(t, 12), 2.0, seed=t)[1]) for t in range(FRAMES)],
+        lambda: shown([6 - abs(t % 12 - 6) for t in range(FRAMES)], noise=0.0),  # back and forth, in a renderer
+        lambda: encoded([(film(12, seed=t)[0], film(12, seed=t)[1]) for t in range(FRAMES)], [85] * FRAMES),
     ],
 )
 def test_scenes_that_stand_still_froze_not(tmp_path: Path, inspect: Inspect, frames: Callable[[], list[Frame]]) -> None:
@@ -134,3 +153,43 @@ def test_a_moving_camera_that_stops_at_once_is_doubtful(tmp_path: Path, inspect:
     _, facts = inspect(write(tmp_path / "r", shown(order, pan=5)))
     said = [c["says"] for c in facts["checks"] if c["about"] == "repeats" and c["verdict"] == "doubtful"]
     assert facts["bad_frames"] or "froze, or stopped at once" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("order", "bad"),
+    [
+        ([*range(20), *range(16, 20), *range(24, FRAMES)], 4),  # a ring buffer is played twice
+        ([t - 2 * (t % 13 == 4) for t in range(FRAMES)], 3),
+        ([8 if t == 30 else t for t in range(FRAMES)], 1),
+        ([30 if t == 8 else t for t in range(FRAMES)], 1),
+    ],
+)
+def test_older_pictures_that_come_again_are_bad(tmp_path: Path, inspect: Inspect, order: list[int], bad: int) -> None:
+    for which in ("color", "depth"):
+        code, facts = inspect(write(tmp_path / which, shown(order, which)))
+        assert (code, len(facts["bad_frames"])) == (0, bad)
+        assert "an older picture came again" in str(facts["bad_frames"][0])
+
+
+def test_a_sequence_played_again_is_told_by_its_jumps(tmp_path: Path, inspect: Inspect) -> None:
+    order = [*range(24), *range(8, 24)]
+    assert_refused(inspect(write(tmp_path / "r", shown(order, noise=0.0))), "16 of 40 frames are bad")
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        lambda: torn(slice(0, 24)),
+        lambda: torn(slice(30, 48), which=(0,)),
+        lambda: torn(slice(None), slice(40, 64), which=(1,)),
+        lambda: encoded(shown(held(16, 24), "color"), [85 + t % 10 for t in range(FRAMES)]),
+        lambda: encoded(shown(held(4, 12), "color", noise=4.0), [70 + t % 6 for t in range(FRAMES)]),
+    ],
+)
+def test_what_froze_in_part_or_was_encoded_anew_is_doubtful(
+    tmp_path: Path, inspect: Inspect, frames: Callable[[], list[Frame]]
+) -> None:
+    _, facts = inspect(write(tmp_path / "r", frames()))
+    (said,) = [c for c in facts["checks"] if c["about"] == "repeats"]
+    assert said["verdict"] == "doubtful"
+    assert "of an earlier one bit by bit" in said["says"] or "far less than the noise" in said["says"]

@@ -99,6 +99,26 @@ def test_every_nth_frame_is_asked_about(tmp_path: Path, inspect: Inspect, keep: 
     check(tmp_path, inspect, name, 30 / keep, fps=30, time_unit="frames")
 
 
+@pytest.mark.parametrize("rate", [30, 24, 15, 60])
+def test_hundredths_of_a_second_are_no_frames(tmp_path: Path, inspect: Inspect, rate: int) -> None:
+    name = lambda t: f"{1000 + round(100 * t / rate):06d}"  # noqa: E731
+    check(tmp_path, inspect, name, None, "times in ticks, as steps from", "'time_unit: frames'", fps=rate)
+
+
+def test_frames_of_which_some_were_kept_are_said_to_be(tmp_path: Path, inspect: Inspect) -> None:
+    for keep, verdict in ((4, "assumed"), (2, "assumed"), (1, "ok")):
+        streams = [named(lambda t, k=keep: f"{k * t:06d}", [0, 1, *range(3, STEPS)])] * 2  # type: ignore[misc]
+        facts = assert_fine(inspect(write(tmp_path / f"{keep}", *streams, fps=30)))
+        (found,) = [c for c in facts["checks"] if c["about"] == "clock"]
+        assert (found["verdict"], f"every {keep}th was kept" in found["says"]) == (verdict, keep > 1)
+
+
+def test_digits_of_a_date_get_no_unit_by_their_step(tmp_path: Path, inspect: Inspect) -> None:
+    """Year, day of the year and time of day; a unit would make a false gap at each minute."""
+    name = lambda t: f"2023318{221358000 + 100 * t}"  # noqa: E731
+    check(tmp_path, inspect, name, None, "digits of a date", "give 'times'")
+
+
 def test_frames_need_a_rate_and_numbers(tmp_path: Path, inspect: Inspect) -> None:
     check(tmp_path, inspect, lambda t: f"{12 * t:04d}", None, "'fps' is not", time_unit="frames")
     check(tmp_path, inspect, lambda t: f"{t / 10:.3f}", None, "no whole numbers", time_unit="frames", fps=10)

@@ -166,6 +166,18 @@ def test_an_installed_package_of_another_age_is_one_sentence(
         tracker.open(dots(2)[0])
 
 
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_torchvision_that_does_not_fit_is_one_sentence(
+    make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: bool
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path / "co-tracker")
+    unfit = "raise RuntimeError('operator torchvision::nms does not exist')\n"
+    (tmp_path / "co-tracker" / "cotracker" / "predictor.py").write_text(unfit)
+    tracker = make(repo=None) if installed else make()
+    with pytest.raises(MissingLibraryError, match=r"does not fit torch; type: pip install torch==\S+ torchvision"):
+        tracker.open(dots(2)[0])
+
+
 class TestWeights:
     def test_published_weights_come_from_the_hubs_cache(self, make: Maker, tmp_path: Path) -> None:
         file = write_cotracker_weights(tmp_path / "torch" / "hub" / "checkpoints" / "scaled_online.pth", False, 16)

@@ -1,7 +1,9 @@
 """The tapnet adapters against stand-ins that enforce the calling contracts of the public PyTorch code."""
 
 import hashlib
+import logging
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_networks import SIZE, dots, write_tapnet
+from fake_networks import SIZE, TAPNext, dots, write_tapnet
 
 from flowlab.errors import FlowlabError, MissingLibraryError, UsageError
 from flowlab.records import Tracks2D
@@ -169,6 +171,33 @@ def test_tracking_is_the_same_every_time_and_leaves_random_numbers_as_they_were(
     assert orders[0] == orders[1]
 
 
+@pytest.mark.parametrize(
+    ("file", "options", "side"),
+    [
+        ("tapnextpp_512.ckpt", {}, 512),
+        ("tapnextpp_ckpt.pt", {}, 256),
+        ("tapnextpp_512.ckpt", {"size": 256}, 256),
+        ("renamed.pt", {"size": 512}, 512),
+    ],
+)
+def test_tapnext_sees_pictures_of_the_size_its_weights_were_trained_on(
+    make: Maker, tmp_path: Path, file: str, options: dict[str, Any], side: int
+) -> None:
+    torch.save({"state_dict": {"tapnext.scale": torch.ones(1)}}, tmp_path / file)
+    clip, truth = dots(frames=4)
+    queries = asked(truth, 0, 0, 1)
+    tracker = make("tapnext", weights=tmp_path / file, **options)
+    check_tracks(tracker.open(clip).track(queries, 0, 4), truth, queries, 0)
+    assert weights._loaded(tracker).side == side
+    assert tracker.describe()["options"]["size"] == side
+
+
+def test_a_package_too_old_for_larger_pictures_is_one_sentence(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(TAPNext, "_video_pos_emb")
+    with pytest.raises(MissingLibraryError, match=r"size 512 need a newer package tapnet.*track.options.size=256"):
+        make("tapnext", size=512).open(dots(2)[0])
+
+
 class TestWeights:
     @BOTH
     def test_published_weights_come_from_the_hubs_cache(self, make: Maker, tmp_path: Path, name: str) -> None:
@@ -209,17 +238,57 @@ class TestWeights:
 
 
 @BOTH
-def test_a_missing_package_is_one_sentence(tmp_path: Path, name: str) -> None:
-    with pytest.raises(MissingLibraryError, match=rf"'{name}' needs the Python package tapnet.*pip install 'tapnet"):
+def test_a_missing_package_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(torch, "__version__", "2.13.0+cpu")
+    with pytest.raises(MissingLibraryError, match=rf"'{name}' needs the Python package tapnet") as caught:
         make_tracker(name).open(dots(2)[0])
+    _, _, advice = str(caught.value).partition("type: ")
+    assert [step.strip().split()[2:4] for step in advice.split("&&")] == [
+        ["torch==2.13.0", "torchvision"],
+        ["--no-deps", "'tapnet"],
+        ["einops", "einshape"],
+    ]
+    assert "--index-url https://download.pytorch.org/whl/cpu " in advice
 
 
 @BOTH
-def test_what_the_package_lacks_is_named(make: Maker, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("fails", "says"),
+    [
+        ("import einops_of_another_world", "einops_of_another_world.*type: pip install einops_of_another_world$"),
+        ("raise ModuleNotFoundError('no tree', name='tree')", "type: pip install dm-tree$"),
+        (
+            "raise RuntimeError('operator torchvision::nms does not exist')",
+            r"torchvision is missing or does not fit torch; type: pip install torch==\S+ torchvision",
+        ),
+        (
+            "raise ModuleNotFoundError(\"No module named 'torchvision'\", name='torchvision')",
+            r"type: pip install torch==\S+ torchvision",
+        ),
+        ("from torch import nothing_of_that_name", "nothing_of_that_name.*pip install --no-deps 'tapnet"),
+    ],
+)
+def test_what_the_package_lacks_is_named(make: Maker, tmp_path: Path, name: str, fails: str, says: str) -> None:
     for module in ("torch/tapir_model.py", "tapnext/tapnext_torch.py"):
-        (tmp_path / "site" / "tapnet" / module).write_text("import einshape_of_another_world\n")
-    with pytest.raises(MissingLibraryError, match="einshape_of_another_world"):
+        (tmp_path / "site" / "tapnet" / module).write_text(f"{fails}\n")
+    with pytest.raises(MissingLibraryError, match=says):
         make(name).open(dots(2)[0])
+
+
+def test_who_waits_for_a_network_is_told_for_what(
+    make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        make("bootstapir").open(dots(2)[0])
+        assert "MB" not in caplog.text
+        weights._loaded.cache_clear()
+        monkeypatch.setattr(weights, "SLOW_S", 0.01)
+        for step in ("build", "restore"):
+            slowly = getattr(BootsTapir, step)
+            monkeypatch.setattr(BootsTapir, step, lambda *given, slowly=slowly: (time.sleep(0.3), slowly(*given))[1])
+        make("bootstapir").open(dots(2)[0])
+    assert "'bootstapir': importing its code" in caplog.text
+    assert f"'bootstapir': reading its weights from {tmp_path / 'bootstapir.pt'} (0 MB)" in caplog.text
 
 
 def test_sizes_that_the_network_cannot_take_are_refused(make: Maker) -> None:

@@ -35,6 +35,7 @@ from trained_runs import (
 from flowlab.policies.profiles import load_settings
 from flowlab.policies.run_folder import RESUME
 from flowlab.training import run as training_run
+from flowlab.training.resume import resume_run
 
 Capture = pytest.CaptureFixture[str]
 STEPS = 130
@@ -158,7 +159,7 @@ def test_wherever_a_run_stops_nothing_is_lost(variant: str, rolls: Path, tmp_pat
         if name == "broken":
             for steps in (1, 7, 12):
                 assert not training_run.run(trainer, lambda _: None, stop_after(steps))
-                trainer = training_run.resume_run(tmp_path / name)
+                trainer = resume_run(tmp_path / name)
             assert trainer.step == 20
         assert training_run.run(trainer, lambda _: None)
     check_same(tmp_path / "broken", tmp_path / "unbroken")

@@ -7,6 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
+from flowlab.errors import UsageError
 from flowlab.grading.scenes.motions import (
     Motion,
     Path,
@@ -276,3 +277,22 @@ FAMILIES = MappingProxyType(
     }
 )
 """By name. Of those that are held out nothing may be learned, by a seed or by looking."""
+
+
+def making_films(seeds: Sequence[int]) -> list[tuple[str, int]]:
+    """The films that a tracker may be made and calibrated with.
+
+    Args:
+        seeds: Of each family.
+
+    Returns:
+        Families that are not held out, each with every seed.
+
+    Raises:
+        UsageError: A seed is one of those for reporting.
+    """
+    if reported := [seed for seed in seeds if seed >= FIRST_REPORTED_SEED]:
+        raise UsageError(
+            f"seed {reported[0]} is for reporting; make and calibrate with seeds below {FIRST_REPORTED_SEED}"
+        )
+    return [(f.name, seed) for f in FAMILIES.values() if not f.held_out for seed in seeds]

@@ -13,8 +13,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
 from flowlab.recordings.image_files import check_depth
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.poses import check_poses, pose_stream
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata
 from flowlab.recordings.sample_files import check_times, to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.text import cut

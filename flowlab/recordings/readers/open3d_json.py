@@ -9,7 +9,7 @@ import numpy as np
 
 from flowlab.errors import DataError, first_line
 from flowlab.recordings.intrinsics import Intrinsics, distortion_of, is_transposed
-from flowlab.recordings.metadata import FILE_NAME, Metadata
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata
 from flowlab.recordings.unused_files import unread_keys
 from flowlab.recordings.verdicts import Check
 from flowlab.text import cut, shown

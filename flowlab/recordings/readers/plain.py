@@ -11,8 +11,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import Streams
 from flowlab.recordings.file_stamps import read_names
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES, color_stream, depth_stream, list_images
-from flowlab.recordings.metadata import FILE_NAME, TRUE_TRACKS, Metadata, load_metadata
 from flowlab.recordings.readers.open3d_json import FILES, open3d_calibration
+from flowlab.recordings.recording_yaml import FILE_NAME, TRUE_TRACKS, Metadata, load_metadata
 from flowlab.recordings.sample_files import load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.writing import write_rgbd_recording

@@ -8,9 +8,9 @@ from flowlab.errors import DataError, MissingLibraryError
 from flowlab.files import new_folder
 from flowlab.limits import MAX_ARRAY_BYTES
 from flowlab.recordings.base import Streams
-from flowlab.recordings.metadata import FILE_NAME, Metadata
 from flowlab.recordings.readers.open3d_json import open3d_calibration
 from flowlab.recordings.readers.plain import read_folder
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut
 from flowlab.untrusted import check_regular, read_json

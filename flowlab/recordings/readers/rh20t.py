@@ -18,8 +18,8 @@ from flowlab.geometry.transforms import inverse
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import COLOR_SUFFIXES, color_stream, depth_stream, list_images
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import FILE_NAME, Metadata, check_rigid
 from flowlab.recordings.readers.safe_pickle import pickled_numbers
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata, check_rigid
 from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.unused_files import unread_keys

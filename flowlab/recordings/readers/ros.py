@@ -8,7 +8,6 @@ import numpy as np
 
 from flowlab.errors import DataError
 from flowlab.recordings.base import ImageStream, SampleStream, Streams
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.poses import pose_stream
 from flowlab.recordings.readers.publishers import counted, tell_apart
 from flowlab.recordings.readers.realsense import is_sdk_bag
@@ -19,6 +18,7 @@ from flowlab.recordings.readers.ros_poses import TYPES as POSES
 from flowlab.recordings.readers.ros_poses import read_pose_topic
 from flowlab.recordings.readers.ros_samples import group_samples
 from flowlab.recordings.readers.ros_topics import IMAGES, JOINTS, ChosenTopics, choose_topics
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import cut

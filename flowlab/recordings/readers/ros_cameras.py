@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import Metadata
 from flowlab.recordings.readers.ros_bag import RosBag
 from flowlab.recordings.readers.ros_camera_info import intrinsics_over_time
 from flowlab.recordings.readers.ros_messages import depth_unit_of, relative_pose
 from flowlab.recordings.readers.ros_topics import REGISTERED, ChosenTopics, camera_of, of_two_cameras
+from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import shown
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from flowlab.errors import DataError
-from flowlab.recordings.metadata import FILE_NAME, Metadata, Topics
 from flowlab.recordings.readers.ros_bag import RosBag
 from flowlab.recordings.readers.ros_messages import CONVERT, is_color, is_depth, is_read
+from flowlab.recordings.recording_yaml import FILE_NAME, Metadata, Topics
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"

@@ -10,8 +10,8 @@ from flowlab.errors import DataError
 from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.image_files import color_stream, depth_stream
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import TRUE_TRACKS, Metadata
 from flowlab.recordings.poses import pose_stream, read_poses
+from flowlab.recordings.recording_yaml import TRUE_TRACKS, Metadata
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.text import is_path_inside, shown
@@ -87,9 +87,11 @@ def _passed_over(
 ) -> tuple[tuple[str, str], ...]:
     """What such folders have beside what is used."""
     known = [("accelerometer.txt", "how the camera was accelerated")]
-    if lists[0] == lists[1]:  # associations leave out pictures without a partner
-        folders = {Path(entry[1]).parent.as_posix() for entry in (*color, *depth)}
-        known += [(f"{folder}/*.png", f"not in {lists[0]}") for folder in sorted(folders - {"."})]
+    # Associations leave out pictures without a partner, and lists what the camera dropped.
+    folders = {Path(entry[1]).parent.as_posix() for entry in (*color, *depth)}
+    named = " and ".join(dict.fromkeys(lists))
+    known += [(f"{folder}/*.png", f"not in {named}") for folder in sorted(folders - {"."})]
+    if lists[0] == lists[1]:
         return (*known, *((name, f"{lists[0]} is used") for name in (*LISTS, *ASSOCIATIONS)))
     return (*known, *((name, "the lists are used") for name in ASSOCIATIONS))
 

@@ -12,7 +12,13 @@ from pydantic import ValidationInfo, field_validator
 from flowlab.errors import MissingLibraryError
 from flowlab.records import Clip, Tracks2D
 from flowlab.tracking.base import Session
-from flowlab.tracking.trackers.weights import PretrainedSession, PretrainedTracker, read_weights
+from flowlab.tracking.trackers.weights import (
+    PretrainedSession,
+    PretrainedTracker,
+    brief,
+    import_advice,
+    read_weights,
+)
 
 Mode = Literal["offline", "online"]
 _GITHUB = "facebookresearch/co-tracker"
@@ -84,10 +90,11 @@ class CoTracker(PretrainedTracker):
             code = importlib.import_module("cotracker.predictor")
             predictor = code.CoTrackerOnlinePredictor if self.mode == "online" else code.CoTrackerPredictor
             return predictor(checkpoint=None, v2=self._v2, window_len=self._releases[self.mode].window)
-        except (ImportError, AttributeError, TypeError) as error:
+        except (ImportError, OSError, RuntimeError, AttributeError, TypeError) as error:
+            advice = import_advice(error) or f"type: pip install -U git+https://github.com/{_GITHUB}"
             raise MissingLibraryError(
-                f"tracker '{self.name}': the installed Python package cotracker cannot be used ({error}); "
-                f"type: pip install -U git+https://github.com/{_GITHUB}"
+                f"tracker '{self.name}': the installed Python package cotracker cannot be used ({brief(error)}); "
+                f"{advice}"
             ) from error
 
     def _from_hub(self, repo: str) -> Any:
@@ -101,9 +108,13 @@ class CoTracker(PretrainedTracker):
         except ModuleNotFoundError as error:
             raise MissingLibraryError(
                 f"tracker '{self.name}': CoTracker's code from {repo} needs the Python package {error.name}; "
-                f"type: pip install {error.name}"
+                + (import_advice(error) or f"type: pip install {error.name}")
             ) from error
         except (OSError, RuntimeError, ValueError, ImportError) as error:
+            if advice := import_advice(error):
+                raise MissingLibraryError(
+                    f"tracker '{self.name}': CoTracker's code from {repo} cannot be imported ({brief(error)}); {advice}"
+                ) from error
             raise MissingLibraryError(
                 f"tracker '{self.name}': CoTracker's code cannot be had from {repo} ({error}); delete an outdated copy "
                 f"in {hub.get_dir()} if there is one, or where there is a network type: git clone "

@@ -2,7 +2,8 @@
 
 Both look at square pictures and speak of *raster* coordinates, in the order (t, y, x): (0, 0) is the upper left
 corner of the first pixel, so the center of pixel i is i + 0.5. Pictures are resized without moving their borders
-(``align_corners=False``), which scales raster coordinates and nothing else. With a picture W wide resized to S:
+(``align_corners=False``), which scales raster coordinates and nothing else. With a picture W wide resized to S
+(TAPNext's coordinates are those of S = 256, also where its pictures are larger):
 
     x_raster = (x + 0.5) * S / W        x = x_raster * W / S - 0.5
 
@@ -20,11 +21,25 @@ from pydantic import Field
 from flowlab.errors import MissingLibraryError
 from flowlab.records import Clip, Tracks2D
 from flowlab.tracking.base import Session
-from flowlab.tracking.trackers.weights import PretrainedSession, PretrainedTracker, read_weights
+from flowlab.tracking.trackers.weights import (
+    PretrainedSession,
+    PretrainedTracker,
+    brief,
+    import_advice,
+    read_weights,
+    torch_command,
+)
 
 _PUBLISHED = "https://storage.googleapis.com/dm-tapnet"
 _NATIVE = 256
 """Side of the pictures that both networks were trained on."""
+_FINE = "tapnextpp_512.ckpt"
+"""The published weights of TAPNext++ that were trained on larger pictures; nothing in them says so but the name."""
+_TAPNET = "'tapnet @ git+https://github.com/google-deepmind/tapnet.git'"
+_TAPNET_NEEDS = "einops einshape dm-tree dm-haiku chex jax jaxline optax matplotlib mediapy tqdm"
+"""What the package imports: less than it asks for, which would bring another OpenCV and another torch."""
+_DISTRIBUTIONS = {"tree": "dm-tree", "haiku": "dm-haiku", "sklearn": "scikit-learn", "cv2": "opencv-python-headless"}
+"""Packages whose name differs from that of their module."""
 
 
 class _Tapnet(PretrainedTracker):
@@ -36,11 +51,19 @@ class _Tapnet(PretrainedTracker):
         """A module of the package. Raises :class:`MissingLibraryError` where it or what it needs is missing."""
         try:
             return importlib.import_module(f"tapnet.{module}")
-        except ImportError as error:
+        except (ImportError, OSError, RuntimeError, AttributeError) as error:  # RuntimeError: an unfit torchvision
             raise MissingLibraryError(
                 f"tracker '{self.name}' needs the Python package tapnet, and importing tapnet.{module} failed "
-                f"({error}); type: pip install 'tapnet[torch] @ git+https://github.com/google-deepmind/tapnet.git'"
+                f"({brief(error)}); {import_advice(error) or _advice(error)}"
             ) from error
+
+
+def _advice(error: Exception) -> str:
+    """What to type where the package or something it imports is missing."""
+    missing = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else "tapnet"
+    if missing != "tapnet":
+        return f"type: pip install {_DISTRIBUTIONS.get(missing, missing)}"
+    return f"type: {torch_command('torchvision')} && pip install --no-deps {_TAPNET} && pip install {_TAPNET_NEEDS}"
 
 
 class BootsTapir(_Tapnet):
@@ -79,6 +102,19 @@ class TapNext(_Tapnet):
     """
 
     name: ClassVar[str] = "tapnext"
+    size: int | None = Field(default=None, ge=_NATIVE, multiple_of=8)
+    """Side [px] of the square that pictures are resized to: 256, or 512 with the weights ``tapnextpp_512.ckpt``, which
+    were trained on such pictures. Without it the name of the weights' file decides."""
+
+    @property
+    def side(self) -> int:
+        """The size that is used."""
+        return self.size or (2 * _NATIVE if self.weights and self.weights.name == _FINE else _NATIVE)
+
+    def describe(self) -> dict[str, Any]:
+        """As for every tracker with weights, with the size that is used."""
+        told = super().describe()
+        return {**told, "options": {**told["options"], "size": self.side}}
 
     @property
     def weights_url(self) -> str:
@@ -87,7 +123,14 @@ class TapNext(_Tapnet):
 
     def build(self) -> Any:
         """The network, as the published weights need it."""
-        return self.code("tapnext.tapnext_torch").TAPNext(image_size=(_NATIVE, _NATIVE))
+        network = self.code("tapnext.tapnext_torch").TAPNext(image_size=(_NATIVE, _NATIVE))
+        if self.side != _NATIVE and not hasattr(network, "_video_pos_emb"):
+            raise MissingLibraryError(
+                f"tracker '{self.name}': pictures of size {self.side} need a newer package tapnet, which interpolates "
+                f"its position embedding; type: pip install --no-deps --force-reinstall {_TAPNET}, or set option size "
+                f"to {_NATIVE} (--set track.options.size={_NATIVE})"
+            )
+        return network
 
     def restore(self, network: Any, file: Path) -> None:
         """Load weights of either kind that is published: JAX's (``.npz``), or torch's, as of TAPNext++."""
@@ -98,19 +141,21 @@ class TapNext(_Tapnet):
 
     def session(self, network: Any, clip: Clip, device: str) -> Session:
         """A session; every chunk starts with no memory."""
-        return _TapNext(network, clip, device, self.code("tapnext.tapnext_torch_utils").tracker_certainty)
+        certainty = self.code("tapnext.tapnext_torch_utils").tracker_certainty
+        return _TapNext(network, clip, device, self.side, certainty)
 
 
 class _Square(PretrainedSession):
     """The clip in squares, resized once, and the way there and back for coordinates."""
 
-    def __init__(self, network: Any, clip: Clip, device: str, size: int) -> None:
+    def __init__(self, network: Any, clip: Clip, device: str, size: int, units: int | None = None) -> None:
+        """``units``: the side of the square in the network's coordinates, where it is not its side in pixels."""
         import torch
         from torch.nn.functional import interpolate
 
         self._network, self._device, self._size = network, device, size
         height, width = clip.rgb.shape[1:3]
-        self._scale = size / np.array([width, height], np.float32)
+        self._scale = (units or size) / np.array([width, height], np.float32)
         self._video = torch.empty((1, len(clip), size, size, 3), dtype=torch.uint8)
         for t, rgb in enumerate(clip.rgb):
             whole = torch.tensor(rgb).permute(2, 0, 1)[None].float()
@@ -195,10 +240,13 @@ _GRIDS = ("lowres", "hires")
 
 
 class _TapNext(_Square):
-    """A state goes from frame to frame. The network's own positions are (y, x), like its queries."""
+    """A state goes from frame to frame. The network's own positions are (y, x), like its queries.
 
-    def __init__(self, network: Any, clip: Clip, device: str, certainty: Any) -> None:
-        super().__init__(network, clip, device, _NATIVE)
+    Its coordinates are of a square of 256, whatever the size of the pictures.
+    """
+
+    def __init__(self, network: Any, clip: Clip, device: str, size: int, certainty: Any) -> None:
+        super().__init__(network, clip, device, size, _NATIVE)
         self._certainty = certainty
 
     def follow(self, queries_txy: Float32[np.ndarray, "M 3"], start: int, stop: int) -> Tracks2D:

@@ -4,9 +4,11 @@ import hashlib
 import http.client
 import logging
 import sys
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +25,8 @@ from flowlab.tracking.base import Session, Tracker
 from flowlab.untrusted import check_regular
 
 _LOG = logging.getLogger(__name__)
+SLOW_S = 10.0
+"""Who waits longer than this [s] for a network is told for what."""
 
 
 class PretrainedTracker(Tracker):
@@ -65,7 +69,7 @@ class PretrainedTracker(Tracker):
 
     def _file(self) -> Path:
         """The file of weights, downloaded if need be."""
-        return self.weights or _downloaded(self.name, self.weights_url)
+        return self.weights or downloaded(self.name, self.weights_url)
 
     def _device(self) -> str:
         """The device that the options ask for."""
@@ -107,7 +111,14 @@ def _from_query_on(queries_txy: np.ndarray, start: int, found: Tracks2D) -> Trac
     before, at = frame < queries_txy[:, 0], frame == queries_txy[:, 0]
     xy = np.where((before | at)[..., None], queries_txy[:, 1:], found.xy)
     confidence = np.where(at, 1, np.where(before, 0, found.confidence))
-    return Tracks2D(xy.astype(np.float32), (found.visible | at) & ~before, confidence.astype(np.float32))
+    xyz_cam = None if found.xyz_cam is None else found.xyz_cam * ~before[..., None]
+    return replace(
+        found,
+        xy=xy.astype(np.float32),
+        visible=(found.visible | at) & ~before,
+        confidence=confidence.astype(np.float32),
+        xyz_cam=xyz_cam,
+    )
 
 
 @contextmanager
@@ -138,18 +149,34 @@ def read_weights(file: Path) -> Any:
 def _loaded(tracker: PretrainedTracker) -> Any:
     """The network, ready to use; kept because a dataset is many clips for one tracker."""
     device = tracker._device()
-    with _seeded():
+    with _seeded(), _told_when_slow(f"tracker '{tracker.name}': importing its code and building its network"):
         network = tracker.build()
     file = tracker._file()
+    size = f"{file.stat().st_size / 1e6:.0f} MB"
     try:
-        tracker.restore(network, file)
+        with _seeded(), _told_when_slow(f"tracker '{tracker.name}': reading its weights from {file} ({size})"):
+            tracker.restore(network, file)
+    except FlowlabError:
+        raise
     except Exception as error:  # torch, numpy, pickle and zipfile each have their own for a file of something else
         raise FlowlabError(
-            f"tracker '{tracker.name}': {file} does not hold weights that fit ({_brief(error)}); expected a file like "
+            f"tracker '{tracker.name}': {file} does not hold weights that fit ({brief(error)}); expected a file like "
             f"{tracker.weights_url}, which --weights FILE can name"
         ) from error
     _show_license(tracker.name, tracker.license)
     return network.eval().to(device)
+
+
+@contextmanager
+def _told_when_slow(step: str) -> Iterator[None]:
+    """Say what is being done where it takes long, as it does on a slow machine or disk."""
+    timer = threading.Timer(SLOW_S, _LOG.warning, ("flowlab: %s; on a slow machine that takes minutes", step))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @cache
@@ -158,18 +185,18 @@ def _show_license(name: str, terms: str) -> None:
     _LOG.warning("flowlab: tracker '%s' is the work of others, license: %s", name, terms)
 
 
-def _downloaded(name: str, url: str) -> Path:
-    """The file behind a URL, in the folder and under the name that torch.hub uses too."""
+def downloaded(name: str, url: str, folder: str = "") -> Path:
+    """The file behind a URL, in the folder and under the name that torch.hub uses too, or in a folder there."""
     import torch
 
-    file = Path(torch.hub.get_dir()) / "checkpoints" / url.rpartition("/")[2]
+    file = Path(torch.hub.get_dir()) / "checkpoints" / folder / url.rpartition("/")[2]
     if not file.exists():
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             torch.hub.download_url_to_file(url, str(file), progress=sys.stderr.isatty())
         except (OSError, http.client.HTTPException) as error:
             raise FlowlabError(
-                f"tracker '{name}': the weights could not be downloaded ({_brief(error)}); fetch {url} where there is "
+                f"tracker '{name}': the weights could not be downloaded ({brief(error)}); fetch {url} where there is "
                 f"a network and put it at {file}, or type --weights FILE"
             ) from error
     return file
@@ -182,6 +209,22 @@ def _sha256(file: Path) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
-def _brief(error: Exception) -> str:
+def torch_command(*packages: str) -> str:
+    """What to type to install packages that fit the torch that is there, and leave it the build it is."""
+    import torch
+
+    version, _, build = str(torch.__version__).partition("+")
+    index = f" --index-url https://download.pytorch.org/whl/{build}" if build else ""
+    return f"pip install {' '.join([f'torch=={version}', *packages])}{index}"
+
+
+def import_advice(error: Exception) -> str:
+    """What to type where torchvision is missing, or is built for another torch, which is no ImportError; else empty."""
+    if "torchvision" not in str(error):
+        return ""
+    return f"the installed torchvision is missing or does not fit torch; type: {torch_command('torchvision')}"
+
+
+def brief(error: Exception) -> str:
     """The start of a message, on one line."""
     return cut(" ".join(str(error).split()), 160) or type(error).__name__

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from flowlab.errors import DataError
 from flowlab.recordings.base import load_readers
 from flowlab.recordings.intrinsics import Intrinsics
-from flowlab.recordings.metadata import Metadata, combine, load_metadata
 from flowlab.recordings.readers.plain import write_rgbd_recording
 from flowlab.recordings.recording import RecordingSettings, describe
+from flowlab.recordings.recording_yaml import Metadata, combine, load_metadata
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text()
 
@@ -46,6 +46,10 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ),
         ("intrinsics: {fx: true, fy: 1, cx: 0, cy: 0}", "'fx' holds true or false"),
         ("fps: 10\ntask: pour\nfps: 20", "'fps' stands twice, in lines 1 and 3; keep one"),
+        (
+            "intrinsics: {fx: 1, fy: 1, cx: 0, cy: 0, width: 1" + "0" * 400 + "}",
+            "intrinsics.width: .* less than or equal",
+        ),
         ("intrinsics:\n  fx: 60\n  fx: 90", "'fx' stands twice, in lines 2 and 3"),
         ("depth_unit_m: millimeter", r"depth_unit_m: .* \(found 'millimeter'\)"),
         ("- fps", "must be a mapping"),

@@ -109,6 +109,8 @@ class Metadata(FiniteSettings):
     """Names of the columns of ``action`` to take, in this order."""
     action_times: PathInside | None = None
     """File with the time of every row of actions [s]."""
+    one_robot: bool = False
+    """Whether state and actions are one robot's though they leap as those of two that publish in turn."""
     success: bool = True
     """Whether the demonstration solved its task."""
     task: str | None = None
