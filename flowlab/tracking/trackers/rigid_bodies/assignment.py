@@ -92,8 +92,8 @@ def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMoti
 
 
 def _decide_by_surroundings(raw: np.ndarray, cost: np.ndarray, grid: MotionGrid, feature: np.ndarray) -> None:
-    """Spread costs (B, h, w) over plain surfaces, in place: what slides along itself looks as if it stood still, but for
-    its border."""
+    """Spread costs (B, h, w) over plain surfaces, in place: what slides along itself looks as if it stood still, but
+    for its border."""
     best, second = np.partition(cost[:, grid.undecided], 1, axis=0)[:2]
     open_to_doubt = grid.undecided.copy()
     open_to_doubt[grid.undecided] = (second - best < _DOUBTFUL) & (best < _DOUBTED_COST)

@@ -58,7 +58,9 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
     belief = np.exp(-(cost - least) / _COST_SCALE)
     belief /= belief.sum(0)
     spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
-    return PropagatedTracks(path, seen, motion, least, spread, _slip(fit, path, seen), _residual(fit, uv, path, seen, least))
+    return PropagatedTracks(
+        path, seen, motion, least, spread, _slip(fit, path, seen), _residual(fit, uv, path, seen, least)
+    )
 
 
 def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
@@ -79,8 +81,8 @@ def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np
 
 
 def _slip(fit: RigidBodyFit, path: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """How far [m] optical flow has led away (T, M) from the paths, where the points are seen: steps of both are compared
-    in every frame, and added up, since what is left behind by a wrong path is not seen there any more."""
+    """How far [m] optical flow has led away (T, M) from the paths, where the points are seen: steps of both are
+    compared in every frame, and added up, since what is left behind by a wrong path is not seen there any more."""
     uv, z = fit.pictures.project(path), path[..., 2]
     slip = np.zeros_like(path[..., :2])
     for t in range(1, len(path)):
