@@ -38,7 +38,7 @@ def with_camera_motion(
     scene = new_body(pictures, grid, grid.valid)
     for every in (_SOME_FRAMES, 1):
         scene = track_poses(pictures, [scene], rng, _POINTS)[0]
-        moving = replace(pictures, still=scene.motion)
+        moving = replace(pictures, still=scene.motion, still_is_fitted=True)
         found = segment_motion(moving, every)
         if found.static.sum() < _MIN_STATIC_SHARE * found.valid.sum():
             return pictures, grid

@@ -41,6 +41,8 @@ class ClipFeatures:
     still: RigidMotion | None = None
     """How what stands still in the world moves before a camera that moves; None where that stands still, too, or where
     nobody knows."""
+    still_is_fitted: bool = False
+    """Whether that was found in the pictures, and errs as every fitted motion does."""
 
     def __len__(self) -> int:
         return len(self.depth)

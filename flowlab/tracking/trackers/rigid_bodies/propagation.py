@@ -53,7 +53,7 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
     motion = cost.argmin(0)
     every = np.stack([m.apply(xyz) for m in fit.motions])
     path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
-    path = _refine_depth(fit, path, motion > 0)
+    path = _refine_depth(fit, path, (motion > 0) | fit.pictures.still_is_fitted)
     seen, least = _visible(fit, path), cost.min(0)
     belief = np.exp(-(cost - least) / _COST_SCALE)
     belief /= belief.sum(0)
@@ -64,7 +64,7 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
 
 
 def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Paths (T, M, 3) of moving points shifted along their rays to the surface that is read there, smoothly in time.
+    """Paths (T, M, 3) of points whose motion was fitted shifted along their rays to the surface that is read there, smoothly in time.
 
     What is left of a pose's error changes slowly, while the sensor's changes from frame to frame; a still point is
     left alone, since it has no pose to err.
