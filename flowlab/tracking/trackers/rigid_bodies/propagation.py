@@ -64,10 +64,10 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
 
 
 def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Paths (T, M, 3) of points whose motion was fitted shifted along their rays to the surface that is read there, smoothly in time.
+    """Paths (T, M, 3), of points whose motion was fitted shifted along their rays to the surface read there, smoothly.
 
-    What is left of a pose's error changes slowly, while the sensor's changes from frame to frame; a still point is
-    left alone, since it has no pose to err.
+    What is left of a pose's error changes slowly, while the sensor's changes from frame to frame; a still point
+    is left alone where the camera's poses are given, since it has no pose to err.
     """
     z = path[..., 2]
     off = _surfaces.depth_offsets(fit.pictures.depth, fit.pictures.project(path), z)
