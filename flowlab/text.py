@@ -12,8 +12,8 @@ _UNPRINTABLE = re.compile(
 )
 """Controls, terminal escapes, turns of the writing direction, what is not seen, halves of characters; not the end of a
 line, nor what joins letters."""
-_LIKE_A_SPACE = re.compile(r"[\xa0\u1680\u2000-\u200a\u202f\u205f\u3000]")
-"""Names may have them, but who reads of one must see that it is none."""
+_KEPT = "\n\u200c\u200d"
+"""The end of a line, and what joins letters."""
 _MARKUP = re.compile(r"[\\`*_\[\]<>|&~$#!]")
 _LONGEST_NAME = 150
 """Bytes; file systems take 255, and a file in the making has a longer name."""
@@ -25,11 +25,11 @@ def natural_key(text: str) -> list[str | int]:
 
 
 def printable(text: str) -> str:
-    """Text from a file, fit for a terminal: what could move the cursor, cannot be printed or only looks
-    like a space is escaped."""
-    for odd in (_UNPRINTABLE, _LIKE_A_SPACE):
-        text = odd.sub(lambda found: ascii(found.group())[1:-1], text)
-    return text
+    """Text from a file, fit for a terminal: what could move the cursor, is not seen, is no character or
+    only looks like a space is escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in _KEPT else ascii(c)[1:-1] for c in text)
 
 
 def one_line(text: str) -> str:

@@ -48,6 +48,8 @@ class TestText:
     def test_what_looks_like_a_space_and_is_none_is_shown(self) -> None:
         assert shown("left\xa0arm\u2003x\u3000") == r"'left\xa0arm\u2003x\u3000'"
         assert shown("left arm") == "'left arm'"
+        assert shown("\u05fd\ue000") == r"'\u05fd\ue000'", "what is no character"
+        assert printable("\U0001f469\u200d\U0001f680 क\u094d\u200dष") == "\U0001f469\u200d\U0001f680 क\u094d\u200dष"
 
     def test_what_was_found_is_cut(self) -> None:
         bomb = ["x" * 1000] * 1000
