@@ -77,6 +77,8 @@ def parse_json(text: str | bytes, where: str, advice: str = "") -> Any:
         opened = sum(map(text.count, (b"[", b"{") if isinstance(text, bytes) else ("[", "{")))  # type: ignore[arg-type]
         if opened > MAX_NESTING and _depth(values) > MAX_NESTING:
             raise RecursionError
+        if (b"\\u" if isinstance(text, bytes) else "\\u") in text:  # type: ignore[operator]
+            json.dumps(values, ensure_ascii=False).encode()  # half a character could not be written again
     except RecursionError as error:
         raise DataError(f"{where}: is nested too deep{advice}") from error
     except ValueError as error:  # also of text that is no UTF-8, and of integers of thousands of digits

@@ -63,7 +63,8 @@ class TestText:
 
 class TestJSONAndYAML:
     @pytest.mark.parametrize(
-        "text", ["[" * 200_000, "[" * 500 + "]" * 500, '{"a": ' + "9" * 5000 + "}", "", "{", b"\xff\xfe\x00"]
+        "text",
+        ["[" * 200_000, "[" * 500 + "]" * 500, '{"a": ' + "9" * 5000 + "}", "", "{", b"\xff\xfe\x00", '["\\ud800"]'],
     )
     def test_json_that_is_none_is_one_sentence(self, tmp_path: Path, text: str | bytes) -> None:
         path = tmp_path / "flowlab.json"

@@ -7,7 +7,9 @@ from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from flowlab.config import Settings, merge
 from flowlab.data.needs import Needs
+from flowlab.limits import MAX_WIDTH
 
+_Steps = Annotated[int, Field(ge=1, le=MAX_WIDTH)]
 _Proportion = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -88,11 +90,11 @@ class TrainSettings(Settings):
 
     policy: str
     """Name of the policy, or where its class is: ``module:Class``."""
-    n_obs_steps: PositiveInt = 2
+    n_obs_steps: _Steps = 2
     """Frames an action is decided on."""
-    horizon: PositiveInt = 16
+    horizon: _Steps = 16
     """Steps that are predicted, from the first of those frames on."""
-    n_action_steps: PositiveInt = 8
+    n_action_steps: _Steps = 8
     """Of those, how many are executed, from the last of those frames on."""
     batch: BatchSettings = BatchSettings()
     optimizer: OptimizerSettings = OptimizerSettings()

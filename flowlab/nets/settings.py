@@ -1,28 +1,32 @@
 """Settings of the networks."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, model_validator
 
 from flowlab.config import Settings
+from flowlab.limits import MAX_WIDTH
+
+Width = Annotated[int, Field(ge=1, le=MAX_WIDTH)]
+"""Of a layer, or how many points or steps there are: files of strangers may ask for any."""
 
 
 class EncoderSettings(Settings):
     """How clouds and the robot's state become a vector."""
 
-    points: PositiveInt = 1024
+    points: Width = 1024
     """Of each cloud, the first so many: farthest-point samples are nested."""
-    subset: PositiveInt | None = 256
+    subset: Width | None = 256
     """Train on a random subset of so many of them, another in each step: cheaper, and varied. null trains on all."""
-    octaves: int = Field(default=1, ge=0)
+    octaves: int = Field(default=1, ge=0, le=32)
     """Fourier features of the coordinates: sine and cosine of so many octaves."""
     relative: bool = True
     """Give points relative to the gripper, where the data tell where it is."""
-    widths: tuple[PositiveInt, ...] = Field(default=(64, 128, 256), min_length=1)
+    widths: tuple[Width, ...] = Field(default=(64, 128, 256), min_length=1)
     """Layers of the PointNet, each followed by LayerNorm and ReLU, before its max-pool."""
-    features: PositiveInt = 256
+    features: Width = 256
     """Length of a cloud's vector."""
-    state_widths: tuple[PositiveInt, ...] = Field(default=(64, 64), min_length=1)
+    state_widths: tuple[Width, ...] = Field(default=(64, 64), min_length=1)
     """Layers for the robot's state; the last is the length of its vector."""
 
 
@@ -31,9 +35,9 @@ class DenoiserSettings(Settings):
 
     kind: Literal["unet", "mlp"] = "mlp"
     """``unet``: 1D convolutions over time, DP3's. ``mlp``: residual layers over the whole horizon at once."""
-    widths: tuple[PositiveInt, ...] = Field(default=(512, 512, 512), min_length=1)
+    widths: tuple[Width, ...] = Field(default=(512, 512, 512), min_length=1)
     """Channels of each level, or of each residual layer (all alike)."""
-    step_embedding: int = Field(default=64, ge=4, multiple_of=2)
+    step_embedding: int = Field(default=64, ge=4, le=MAX_WIDTH, multiple_of=2)
     """Length of the diffusion step's embedding."""
 
     @model_validator(mode="after")
@@ -53,9 +57,9 @@ class DenoiserSettings(Settings):
 class DiffusionSettings(Settings):
     """DDIM with a squared-cosine schedule, predicting the clean sample."""
 
-    train_steps: PositiveInt = 100
+    train_steps: Width = 100
     """Steps of noise that are trained on."""
-    inference_steps: PositiveInt = 10
+    inference_steps: Width = 10
     """Steps in which noise is taken away in use."""
     loss: Literal["l1", "mse"] = "l1"
     """Distance between a predicted and a clean sample."""
@@ -79,7 +83,7 @@ class MotionSettings(Settings):
     """Deviation of the noise of ``truth-noised``, in normalized units."""
     weight: float = Field(default=0.2, gt=0)
     """Of the motion's loss; the action's has 1."""
-    features: PositiveInt = 128
+    features: Width = 128
     """Length of the summary that the action is conditioned on, and of a query point's own vector."""
     denoiser: DenoiserSettings = DenoiserSettings(widths=(128, 128, 128))
     """The motion's network. With ``per-query``, ``mlp`` is meant, and its widths are those of each query."""

@@ -7,14 +7,14 @@ weight that its quality gives it (``data/batch_builder.py``); the heads that pre
 from typing import Literal
 
 from jaxtyping import Float
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 from torch import Tensor, nn
 
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import CloudNeeds, FlowNeeds, Needs
 from flowlab.data.normalizer import Scaler
 from flowlab.nets.motion import ChannelFlowHead, PerQueryFlowHead, QueryEncoder
-from flowlab.nets.settings import MotionSettings
+from flowlab.nets.settings import MotionSettings, Width
 from flowlab.policies.base import PolicySpec
 from flowlab.policies.diffusion_policy import DiffusionPolicySettings, MotionPolicy
 
@@ -22,14 +22,14 @@ from flowlab.policies.diffusion_policy import DiffusionPolicySettings, MotionPol
 class FlowSettings(MotionSettings):
     """How the flow of query points is learned and predicted."""
 
-    points: PositiveInt = 100
+    points: Width = 100
     """M, the query points of an episode."""
     sampling: Literal["scene", "object", "stratified"] = "scene"
     """Which of the dataset's query points: see :class:`~flowlab.perception.queries.QuerySettings`."""
     flow_representation: Literal["channels", "per-query"] = "per-query"
     """``channels``: one sequence of M x 3 channels, each query its own. ``per-query``: one network for all queries,
     which tell each other what they have in common through their mean and maximum; their order does not matter."""
-    subset: PositiveInt | None = 16
+    subset: Width | None = 16
     """Train on a random subset of so many queries, another in each step; null trains on all. per-query only."""
     occluded_weight: float = Field(default=0.5, ge=0, le=1)
     """Weight in the loss of a point that the camera does not see; one that it sees exactly has 1."""
