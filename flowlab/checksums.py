@@ -18,6 +18,14 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def has_sha256(path: Path, checksum: str) -> bool:
+    """Whether a file's content is what it was; that of one that cannot be read (a broken disk, a link) is not."""
+    try:
+        return sha256_of(path) == checksum
+    except OSError:
+        return False
+
+
 def with_checksum(values: Mapping[str, Any], free: Sequence[str] = ()) -> dict[str, Any]:
     """JSON values, and the SHA-256 of them all as ``sha256``, but for the keys ``free``, which people may change."""
     return {**values, CHECKSUM: json_checksum(values, free)}

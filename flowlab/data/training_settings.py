@@ -9,7 +9,7 @@ from flowlab.config import Settings, merge
 from flowlab.data.needs import Needs
 from flowlab.limits import MAX_WIDTH
 
-_Steps = Annotated[int, Field(ge=1, le=MAX_WIDTH)]
+_Steps = Annotated[int, Field(gt=0, le=MAX_WIDTH)]
 _Proportion = Annotated[float, Field(ge=0, lt=1)]
 
 

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from flowlab.config import Settings
 from flowlab.limits import MAX_WIDTH
 
-Width = Annotated[int, Field(ge=1, le=MAX_WIDTH)]
+Width = Annotated[int, Field(gt=0, le=MAX_WIDTH)]
 """Of a layer, or how many points or steps there are: files of strangers may ask for any."""
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flowlab.checksums import sha256_of
+from flowlab.checksums import has_sha256
 from flowlab.errors import DataError, MissingFileError
 from flowlab.files import locked, remove_leftovers, write_atomically
 from flowlab.provenance import Provenance
@@ -147,7 +147,7 @@ class Dataset(EpisodeSequence):
                 "before there was an episode to look at"
             )
         checksum = next(r.rejects_sha256 for r in self.receipts if r.rejects_shard == ref.shard)
-        if checksum and is_there(self.path / ref.shard) and sha256_of(self.path / ref.shard) != checksum:
+        if checksum and is_there(self.path / ref.shard) and not has_sha256(self.path / ref.shard, checksum):
             raise DataError(
                 f"{self.path / ref.shard}: damaged (its content does not match the checksum in its receipt); {REPAIR}"
             )

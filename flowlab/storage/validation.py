@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flowlab.checksums import sha256_of
+from flowlab.checksums import has_sha256
 from flowlab.errors import DataError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
@@ -58,7 +58,7 @@ def check_unit(dataset: Dataset, receipt: Receipt, *, contents: bool = True) -> 
     its episodes, unless only the damage is asked for."""
     for shard, checksum in (receipt.shard, receipt.shard_sha256), (receipt.rejects_shard, receipt.rejects_sha256):
         place = dataset.path / shard
-        if checksum and place.is_file() and sha256_of(place) != checksum:
+        if checksum and place.is_file() and not has_sha256(place, checksum):
             yield Finding(str(place), f"damaged (its content does not match the checksum in its receipt); {REPAIR}")
             return
     lost = lost_shards(dataset.path, receipt)

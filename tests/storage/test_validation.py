@@ -230,6 +230,17 @@ def test_one_harm_is_one_finding_that_names_the_file(
     assert errors == f"flowlab: {data}: 1 finding\n"
 
 
+def test_a_shard_that_no_disk_can_read_is_damaged(
+    small_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = shutil.copytree(small_dataset, tmp_path / "d")
+    (data / f"{SHARD}.zip").unlink()
+    (data / f"{SHARD}.zip").symlink_to("/proc/self/mem")
+    code, output, _ = call_cli(capsys, "validate", data)
+    assert code == 3
+    assert output.splitlines()[0].startswith(f"{data / SHARD}.zip: damaged")
+
+
 def test_half_a_dataset_is_not_sound(small_dataset: Path, tmp_path: Path, flowlab: Cli) -> None:
     data = shutil.copytree(small_dataset, tmp_path / "d")
     for receipt in (data / "receipts").glob("push-back-*"):
