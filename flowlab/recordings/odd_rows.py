@@ -10,6 +10,8 @@ from flowlab.text import cut
 
 _FAR = 8.0
 """A value this many times the spread of the others away from them is none of them."""
+_ENDS = 4
+"""So many of the least and of the greatest values are looked at."""
 _SPREAD = 5
 """So many different values have a spread."""
 _SELDOM = 1 / 3
@@ -34,7 +36,9 @@ def no_readings(values: Float64[np.ndarray, "T D"], columns: Sequence[str]) -> s
     """
     for k, column in enumerate(values.T):
         found, count = np.unique(column, return_counts=True)
-        for value in found[(count >= 2) & (count <= _SELDOM * len(column))]:
+        ends = np.arange(len(found))  # what is far from all others is among the least or the greatest
+        ends = (ends < _ENDS) | (ends >= len(found) - _ENDS)
+        for value in found[ends & (count >= 2) & (count <= _SELDOM * len(column))]:
             others = column[column != value]
             if len(np.unique(others)) < _SPREAD:
                 continue

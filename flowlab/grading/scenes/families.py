@@ -46,8 +46,6 @@ class Family:
     """Whether it is never used for making or calibrating a tracker, so that it tells what becomes of unknown scenes."""
     looks: tuple[Look, ...] = _PATTERNED
     """Of table and walls."""
-    distance_m: tuple[float, float] = (0.5, 1.1)
-    """From the camera to the middle of the table."""
 
 
 def _free(things: Sequence[Thing], candidate: Thing) -> bool:

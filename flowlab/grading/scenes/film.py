@@ -14,8 +14,9 @@ from flowlab.geometry.camera import Camera
 from flowlab.grading.graded_recording import QueryMix, made_once, write_graded
 from flowlab.grading.scenes.camera_paths import fixed_camera, hand_held
 from flowlab.grading.scenes.families import FAMILIES, Family
-from flowlab.grading.scenes.world import CAMERA, ROBOT, build_world, poses_of
+from flowlab.grading.scenes.world import CAMERA, body_name, build_world, poses_of
 from flowlab.perception.observer import Box, ObserverSettings
+from flowlab.records import Role
 from flowlab.sim.recorder import Rollout
 from flowlab.sim.render.gl import GLRenderer
 from flowlab.sim.scene import Scene
@@ -24,6 +25,8 @@ from flowlab.sim.sensor import PRESETS
 
 _SIZES = ((160, 120), (320, 240), (320, 240), (640, 480))
 _FPS = 15.0
+_DISTANCE_M = (0.5, 1.1)
+"""From the camera to the middle of the table."""
 _EVERYTHING = Box(low=(-4.0, -4.0, -2.0), high=(4.0, 4.0, 4.0))
 
 
@@ -102,10 +105,10 @@ def stage(
     if not things:
         raise UsageError(f"{family.name} seed {seed}: nothing found room; try another seed")
     fovy = float(rng.uniform(38, 58))
-    start = fixed_camera(rng, np.array([0.0, 0.0, 0.03]), family.distance_m)
+    start = fixed_camera(rng, np.array([0.0, 0.0, 0.03]), _DISTANCE_M)
     poses_cam = hand_held(start, steps, rng) if moves else np.broadcast_to(start, (steps, 4, 4))
     model = build_world(things, family.looks, fovy, rng)
-    robots = frozenset(model.body(b).name for b in range(model.nbody) if model.body(b).name.startswith(ROBOT))
+    robots = frozenset(body_name(k, thing) for k, thing in enumerate(things) if thing.role == Role.ROBOT)
     scene = Scene(model, robot_roots=robots)
     camera = Camera.from_fovy(*size, fovy, poses_cam[0])
     shown = SceneSettings(camera=CameraSettings(name=CAMERA, position=None), renderer="gl", rgb=True)

@@ -12,12 +12,9 @@ from scipy.spatial.transform import Rotation
 from flowlab.geometry.camera import GL_TO_CV
 from flowlab.grading.scenes.textures import Look, make_texture
 from flowlab.grading.scenes.things import Solid, Thing
-from flowlab.records import Role
 from flowlab.sim.scene import Poses
 
 CAMERA = "film"
-ROBOT = "robot"
-"""What bodies of hands and arms are called, with a number."""
 _FLAT_PX = 1024
 _HEAD = """<mujoco>
 <compiler angle="radian"/>
@@ -28,6 +25,11 @@ _HEAD = """<mujoco>
 <headlight ambient=".35 .35 .35" diffuse=".3 .3 .3" specular="0 0 0"/>
 </visual>
 """
+
+
+def body_name(k: int, thing: Thing) -> str:
+    """What the body of the k-th thing is called in the model."""
+    return f"{thing.name} {k}"
 
 
 def build_world(
@@ -64,7 +66,7 @@ def build_world(
         look = looks[int(rng.integers(len(looks)))]
         bodies.write(_geom(name, "box", size, at, material(look, flat=True)))
     for k, thing in enumerate(things):
-        name = f"{ROBOT} {k}" if thing.role == Role.ROBOT else f"{thing.name} {k}"
+        name = body_name(k, thing)
         bodies.write(f'<body name="{name}"><freejoint/>')
         looks_of = {look: material(look) for look in dict.fromkeys(s.look for s in thing.solids)}
         for n, solid in enumerate(thing.solids):
