@@ -36,9 +36,9 @@ def no_readings(values: Float64[np.ndarray, "T D"], columns: Sequence[str]) -> s
     """
     for k, column in enumerate(values.T):
         found, count = np.unique(column, return_counts=True)
-        ends = np.arange(len(found))  # what is far from all others is among the least or the greatest
-        ends = (ends < _ENDS) | (ends >= len(found) - _ENDS)
-        for value in found[ends & (count >= 2) & (count <= _SELDOM * len(column))]:
+        place = np.arange(len(found))  # what is far from all others is among the least or the greatest
+        at_ends = (place < _ENDS) | (place >= len(found) - _ENDS)
+        for value in found[at_ends & (count >= 2) & (count <= _SELDOM * len(column))]:
             others = column[column != value]
             if len(np.unique(others)) < _SPREAD:
                 continue
