@@ -10,7 +10,7 @@ from flowlab.geometry.moving import MOVING_IN_EPISODE_M
 from flowlab.recordings.verdicts import stored_checks, worst_first
 from flowlab.records import Episode, PositionSource, Role
 from flowlab.text import markdown
-from flowlab.viz.colors import SIGMA_LIMIT
+from flowlab.viz.stated_error import describe_shares
 
 
 def caption(episode: Episode, shown: int) -> str:
@@ -28,10 +28,11 @@ def caption(episode: Episode, shown: int) -> str:
 
 
 def _ending(episode: Episode) -> str:
-    """When an episode was solved; of a recording, how sure its tracks are."""
+    """When an episode was solved; of a recording, who made its tracks and how sure they are."""
     if episode.tracks.quality is not None:  # of a recording, which nobody needs to tell whether it succeeded
-        return sigma_summary(episode)
-    return f"solved at step {int(episode.success.argmax())}" if episode.success.any() else "not solved"
+        return f"tracker {tracker_name(episode)}: {sigma_summary(episode)}"
+    solved = f"solved at step {int(episode.success.argmax())}" if episode.success.any() else "not solved"
+    return f"{solved}   ·   exact tracks"
 
 
 def sigma_summary(episode: Episode, t: int | slice = slice(None)) -> str:
@@ -111,8 +112,9 @@ def _describe_quality(episode: Episode) -> dict[str, str]:
             f"{n:.0%} {PositionSource(s).name.lower()}" for s, n in zip(source, shares, strict=True)
         ),
         "stated error": sigma_summary(episode),
-        "color of tracks": f"stated error σ, from 0 (turquoise) over {500 * SIGMA_LIMIT:.0f} mm (yellow) "
-        f"to {1000 * SIGMA_LIMIT:.0f} mm and more (red); dark where out of sight",
+        "stated below": describe_shares(quality.sigma[:, :count]),
+        "color of tracks": "class of the stated error σ: turquoise below 5 mm, yellow 10, orange 20, red 50, purple "
+        "from there on; dark where out of sight",
     }
 
 

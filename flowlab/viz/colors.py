@@ -1,10 +1,11 @@
 """The colors that recordings, stills and videos share: tracks loud, by role or by stated error; clouds quiet."""
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
 
 from flowlab.records import Episode, Role
+from flowlab.viz.stated_error import sigma_rgb, stated_sigma
 
 UNKNOWN = -1
 """Stands for the role of a point whose owner is not known."""
@@ -17,10 +18,6 @@ ROLE_RGB = {
     UNKNOWN: (163, 130, 200),
 }
 """sRGB of each role; told apart by people who confuse red with green, too."""
-SIGMA_LIMIT = 0.04
-"""Stated errors from here on [m] have the color of the worst. The scale is the same in every picture."""
-SIGMA_RGB = ((40, 226, 204), (250, 214, 70), (240, 44, 82))
-"""sRGB of stated errors of 0, half the limit, and the limit; others lie between. Told apart as above."""
 SERIES_RGB = [
     (94, 160, 230), (245, 156, 80), (108, 196, 150), (230, 112, 162), (178, 150, 218), (222, 200, 90),
     (110, 205, 215), (226, 112, 98), (170, 178, 188),
@@ -39,18 +36,11 @@ def role_rgb(role: Int[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:
     return colors
 
 
-def sigma_rgb(sigma: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:
-    """The color of each stated error [m]."""
-    level = np.nan_to_num(sigma / SIGMA_LIMIT, nan=1.0)
-    channels = [np.interp(level, [0, 0.5, 1], anchors) for anchors in zip(*SIGMA_RGB, strict=True)]
-    return np.stack(channels, -1).round().astype(np.uint8)
-
-
 def track_rgb(episode: Episode) -> UInt8[np.ndarray, "T M 3"]:
     """The color of every distinct query point at every step: by stated error where there is one, else by role."""
-    M, quality = episode.queries.count, episode.tracks.quality
-    if quality is not None:
-        return sigma_rgb(quality.sigma[:, :M])
+    M, sigma = episode.queries.count, stated_sigma(episode)
+    if sigma is not None:
+        return sigma_rgb(sigma)
     return np.broadcast_to(role_rgb(episode.query_role[:M]), (len(episode), M, 3))
 
 

@@ -24,7 +24,8 @@ TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#3b1f8f", "#a3218e", "
 """From the first step to the last: distinct from gray and readable on white."""
 LEFT = 0.025
 _SIZE_IN = (12.0, 6.4)
-_BOXES = {"camera": (LEFT, 0.145, 0.43, 0.70), "side": (0.525, 0.145, 0.40, 0.70), "bar": (0.945, 0.145, 0.009, 0.70)}
+_BOXES = {"camera": (LEFT, 0.145, 0.43, 0.70), "side": (0.525, 0.145, 0.40, 0.70)}
+BAR = (0.945, 0.145, 0.009, 0.70)
 """Left, bottom, width and height of each panel, as shares of the picture."""
 
 
@@ -32,7 +33,7 @@ def two_panels(title: str, caption: str) -> tuple[Figure, Axes, Axes]:
     """A figure with a title, a caption, and room for a camera's view and a side view."""
     figure = new_figure(*_SIZE_IN)
     figure.text(LEFT, 0.955, label_text(title, 120), fontsize=17, weight="bold", color=INK, va="center")
-    figure.text(LEFT, 0.038, label_text(caption, 250), fontsize=9.5, color=QUIET, va="center")
+    figure.text(LEFT, 0.032, label_text(caption, 250), fontsize=9.5, color=QUIET, va="center")
     return figure, figure.add_axes(_BOXES["camera"]), figure.add_axes(_BOXES["side"])
 
 
@@ -122,17 +123,17 @@ def trail_lines(track: Float[np.ndarray, "T 2"], width: float = 1.2) -> LineColl
 def draw_time_bar(figure: Figure, end: float, label: str, *, whole: bool = False) -> None:
     """The legend of :data:`TIME_COLORS`, from 0 to ``end``, with ``whole`` numbers or any."""
     times = ScalarMappable(Normalize(0, max(end, 1e-9)), TIME_COLORS)
-    bar = figure.colorbar(times, cax=figure.add_axes(_BOXES["bar"]), ticks=MaxNLocator(6, integer=whole))
+    bar = figure.colorbar(times, cax=figure.add_axes(BAR), ticks=MaxNLocator(6, integer=whole))
     bar.outline.set_visible(False)
     bar.set_label(label, color=QUIET, fontsize=LABEL_PT)
     bar.ax.tick_params(length=0, labelsize=TICK_PT, labelcolor=QUIET)
 
 
-def draw_legend(figure: Figure, entries: Sequence[Line2D], length: float = 0.8) -> None:
-    """One line between panels and caption; lines in it are ``length`` letters long."""
+def draw_legend(figure: Figure, entries: Sequence[Line2D], length: float = 0.8, *, bottom: float = 0.078) -> None:
+    """One line between panels and caption, from ``bottom`` up; lines in it are ``length`` letters long."""
     figure.legend(
-        handles=entries, loc="lower left", bbox_to_anchor=(LEFT, 0.078), ncols=len(entries), frameon=False,
-        fontsize=9.5, labelcolor=INK, handlelength=length, handletextpad=0.5, columnspacing=1.8, borderpad=0,
+        handles=entries, loc="lower left", bbox_to_anchor=(LEFT, bottom), ncols=len(entries), frameon=False,
+        fontsize=9.5, labelcolor=INK, handlelength=length, handletextpad=0.5, columnspacing=1.7, borderpad=0,
         borderaxespad=0,
     )  # fmt: skip
 

@@ -15,9 +15,10 @@ from flowlab.records import Episode, FlowPrediction
 from flowlab.text import one_line
 from flowlab.viz.blueprint import CAMERA, CHECKS, DEPTH, INFO, RGB, make_blueprint, scene_size
 from flowlab.viz.captions import describe, describe_checks
-from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SIGMA_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
+from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
 from flowlab.viz.orientation import world_is_camera_frame
 from flowlab.viz.plan_predictions import PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
+from flowlab.viz.stated_error import SIGMA_RGB
 
 TRAIL_STEPS = 20
 """A trail shows where a point was over this many steps."""
@@ -197,7 +198,7 @@ def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
         seen = 100 * episode.tracks.visible[:, :M].mean(1)
         for key, values, name, color in [
             ("sigma_median", median, "σ median [mm]", SIGMA_RGB[0]),
-            ("sigma_p90", p90, "σ 90th percentile [mm]", SIGMA_RGB[2]),
+            ("sigma_p90", p90, "σ 90th percentile [mm]", SIGMA_RGB[3]),
             ("visible", seen, "in sight [%]", SUCCESS_RGB),
         ]:
             _send_line(recording, episode, f"quality/{key}", values, name=name, color=color)

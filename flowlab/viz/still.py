@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from flowlab.records import Episode
 from flowlab.viz.captions import caption, moving
-from flowlab.viz.colors import SIGMA_LIMIT, cloud_rgb_at, role_rgb, sigma_rgb
+from flowlab.viz.colors import cloud_rgb_at, role_rgb
+from flowlab.viz.error_marks import draw_error_circles, draw_share_bar, error_color, error_legend, error_trail
 from flowlab.viz.orientation import is_upside_down, project_upright
 from flowlab.viz.panels import (
     LEFT,
@@ -26,7 +27,8 @@ from flowlab.viz.panels import (
     trail_lines,
     two_panels,
 )
-from flowlab.viz.plot_style import ALARM, QUIET, label_text, plain_style, save_png, set_heading
+from flowlab.viz.plot_style import ALARM, INK, QUIET, label_text, plain_style, save_png, set_heading
+from flowlab.viz.stated_error import COARSE_M, stated_sigma
 
 TRAILS_PER_ROLE = 24
 """More trails than this hide each other."""
@@ -48,7 +50,10 @@ def plot_still(episode: Episode, title: str, note: str = "") -> Figure:
     _draw_camera_view(camera, episode)
     _draw_side_view(side, episode)
     _draw_legend(figure, episode)
-    draw_time_bar(figure, float(episode.time_s[-1]), "time [s]")
+    if (sigma := stated_sigma(episode)) is None:
+        draw_time_bar(figure, float(episode.time_s[-1]), "time [s]")
+    else:
+        draw_share_bar(figure, sigma)
     figure.text(
         LEFT, 0.91, label_text(shorten(note, 170, placeholder=" …"), 180), fontsize=10, color=ALARM, va="center"
     )
@@ -67,7 +72,9 @@ def _draw_camera_view(axes: Axes, episode: Episode) -> None:
     cloud = episode.point_cloud[0, : episode.point_count[0]]
     depth = episode.camera.project(cloud)[1]
     tracks = project_upright(episode.camera, episode.tracks.xyz_world[:, : episode.queries.count])
-    _draw_scene(axes, episode, project_upright(episode.camera, cloud), depth, tracks)
+    end_z = episode.camera.project(episode.tracks.xyz_world[-1, : episode.queries.count])[1]
+    unit = episode.camera.K[0, 0] / np.where(end_z > 0, end_z, np.nan)
+    _draw_scene(axes, episode, project_upright(episode.camera, cloud), depth, tracks, unit)
     style_as_picture(axes)
     turned = " (turned upright)" if is_upside_down(episode.camera) else ""
     set_heading(axes, f"first cloud and tracks, from the camera{turned}")
@@ -79,7 +86,7 @@ def _draw_side_view(axes: Axes, episode: Episode) -> None:
     tracks = episode.tracks.xyz_world[:, : episode.queries.count]
     moves = moving(episode)
     view = SideView(episode.camera, tracks, tracks[:, moves] if moves.any() else tracks)
-    _draw_scene(axes, episode, view.project(cloud), view.depth(cloud), view.project(tracks))
+    _draw_scene(axes, episode, view.project(cloud), view.depth(cloud), view.project(tracks), np.ones(tracks.shape[1]))
     view.label(axes)
     set_heading(axes, f"the same, seen from {view.name}")
 
@@ -90,34 +97,68 @@ def _draw_scene(
     cloud: Float[np.ndarray, "P 2"],
     depth: Float[np.ndarray, "P"],
     tracks: Float[np.ndarray, "T M 2"],
+    unit: Float[np.ndarray, "M"],
 ) -> None:
-    """The first cloud, far points first, and the tracks, in the plane of the axes."""
-    margin = 0.0 if episode.tracks.quality is None else 0.5  # a point that got lost shall not shrink the rest
+    """The first cloud, far points first, and the tracks, in the plane of the axes, where a meter at the end of each
+    track has a length ``unit``."""
+    sigma = stated_sigma(episode)
+    margin = 0.0 if sigma is None else 0.5  # a point that got lost shall not shrink the rest
     fit_limits(axes, np.concatenate([cloud, tracks.reshape(-1, 2)]), margin)
     draw_cloud(axes, cloud, depth, cloud_rgb_at(episode, 0))
-    still, drawn = ~moving(episode), _drawn_trails(episode)
-    ink = _ink(episode)
-    start, end = tracks[0].T, tracks[-1].T
-    axes.scatter(start[0, still], start[1, still], 6, c=ink[still], linewidths=0, zorder=3)
+    still = ~moving(episode)
+    axes.scatter(*tracks[0, still].T, 6, c=_ink(episode)[still], linewidths=0, zorder=3)
+    if sigma is None:
+        _draw_exact_trails(axes, episode, tracks)
+    else:
+        _draw_estimated_trails(axes, episode, tracks, sigma, unit)
+
+
+def _draw_exact_trails(axes: Axes, episode: Episode, tracks: Float[np.ndarray, "T M 2"]) -> None:
+    """The trails of points that move, colored by time."""
+    drawn = _drawn_trails(episode)
     for k in drawn:
         axes.add_collection(trail_lines(tracks[:, k]), autolim=False)
-    axes.scatter(start[0, drawn], start[1, drawn], 14, c="white", edgecolors=ink[drawn], linewidths=1, zorder=5)
-    axes.scatter(end[0, drawn], end[1, drawn], 17, color=TIME_COLORS(1.0), edgecolors="white", linewidths=0.6, zorder=6)
+    edges = _ink(episode)[drawn]
+    axes.scatter(*tracks[0, drawn].T, 14, c="white", edgecolors=edges, linewidths=1, zorder=5)
+    axes.scatter(*tracks[-1, drawn].T, 17, color=TIME_COLORS(1.0), edgecolors="white", linewidths=0.6, zorder=6)
+
+
+def _draw_estimated_trails(
+    axes: Axes,
+    episode: Episode,
+    tracks: Float[np.ndarray, "T M 2"],
+    sigma: Float[np.ndarray, "T M"],
+    unit: Float[np.ndarray, "M"],
+) -> None:
+    """The trails of points that move, colored by stated error; where that is large, a circle around their ends."""
+    drawn, visible = _drawn_trails(episode), episode.tracks.visible
+    for k in drawn:
+        axes.add_collection(error_trail(tracks[:, k], sigma[:, k], visible[:, k]), autolim=False)
+    draw_error_circles(axes, tracks[-1, drawn], sigma[-1, drawn] * unit[drawn], sigma[-1, drawn])
+    axes.scatter(*tracks[0, drawn].T, 10, c="white", edgecolors=QUIET, linewidths=0.8, zorder=5)
+    for ends, size, faces in ((drawn[visible[-1, drawn]], 20, None), (drawn[~visible[-1, drawn]], 16, "white")):
+        ink = error_color(sigma[-1, ends])
+        edges = "white" if faces is None else ink
+        axes.scatter(
+            *tracks[-1, ends].T, size, c=ink if faces is None else faces, edgecolors=edges, linewidths=1, zorder=6
+        )
 
 
 def _ink(episode: Episode) -> Float[np.ndarray, "M 3"]:
     """The color of every distinct query point's dot: by its median stated error, or by role."""
-    count, quality = episode.queries.count, episode.tracks.quality
-    rgb = role_rgb(episode.query_role) if quality is None else sigma_rgb(np.median(quality.sigma, axis=0))
-    return rgb[:count] / 255 * 0.8
+    sigma = stated_sigma(episode)
+    if sigma is not None:
+        return error_color(np.median(sigma, axis=0))
+    return role_rgb(episode.query_role[: episode.queries.count]) / 255 * 0.8
 
 
 def _draw_legend(figure: Figure, episode: Episode) -> None:
     """What marks and colors mean."""
-    dots = role_dots(episode)
-    if episode.tracks.quality is not None:
-        sigmas = np.array([0, 0.5, 1]) * SIGMA_LIMIT
-        names = [f"σ = {1000 * x:.0f} mm" for x in sigmas[:2]] + [f"≥ {1000 * SIGMA_LIMIT:.0f} mm"]
-        dots = [dot(name, tuple(0.8 * sigma_rgb(x) / 255), "none") for name, x in zip(names, sigmas, strict=True)]
-    dots += [dot("start", "white", QUIET), dot("end", TIME_COLORS(1.0), "none")]
-    draw_legend(figure, dots)
+    sigma = stated_sigma(episode)
+    if sigma is None:
+        draw_legend(figure, [*role_dots(episode), dot("start", "white", QUIET), dot("end", TIME_COLORS(1.0), "none")])
+        return
+    marks = [dot("start", "white", QUIET), dot("end", INK, "none"), dot("end, out of sight", "white", INK)]
+    circle = dot(f"radius σ ≥ {1000 * COARSE_M:.0f} mm", "none", INK)
+    circle.set_markersize(11)
+    draw_legend(figure, [*error_legend(sigma), *marks, circle], bottom=0.06)

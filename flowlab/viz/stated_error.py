@@ -1,0 +1,50 @@
+"""Stated errors as colors, classes and shares: the same in films, stills and recordings."""
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from flowlab.records import Episode
+
+SIGMA_STEPS_M = (0.005, 0.01, 0.02, 0.05)
+"""Stated errors are shown in classes that end below these [m], and a last one without end."""
+SIGMA_RGB = ((128, 246, 231), (236, 208, 40), (245, 138, 20), (228, 44, 50), (150, 28, 110))
+"""sRGB of the classes: the larger the error, the darker. Told apart by color-blind people, and in gray."""
+SIGMA_NAMES = ("< 5 mm", "< 10 mm", "< 20 mm", "< 50 mm", "≥ 50 mm")
+COARSE_M = 0.02
+"""What is stated from here on [m] is drawn as unsure: with faint trails, and a circle of radius σ around the mark."""
+_PALETTE = np.array(SIGMA_RGB, np.uint8)
+
+
+def sigma_class(sigma: Float[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
+    """The class of each stated error [m], counted from 0; what is not a number is in the last."""
+    return np.digitize(sigma, SIGMA_STEPS_M)
+
+
+def sigma_rgb(sigma: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:
+    """The color of each stated error [m]."""
+    colors: np.ndarray = _PALETTE[sigma_class(sigma)]
+    return colors
+
+
+def stated_sigma(episode: Episode) -> Float[np.ndarray, "T M"] | None:
+    """The stated errors [m] of the distinct query points; None of exact tracks."""
+    quality = episode.tracks.quality
+    return None if quality is None else quality.sigma[:, : episode.queries.count]
+
+
+def class_shares(sigma: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "5"]:
+    """Which share of stated errors is in each class."""
+    counts = np.bincount(sigma_class(sigma).ravel(), minlength=len(SIGMA_RGB))
+    return counts / max(sigma.size, 1)
+
+
+def shares_below(sigma: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "5"]:
+    """Which share of stated errors is below the end of each class; of the last, which share is in it."""
+    shares = class_shares(sigma)
+    return np.append(np.cumsum(shares[:-1]), shares[-1])
+
+
+def describe_shares(sigma: Float[np.ndarray, "*batch"]) -> str:
+    """Which share of stated errors is below the end of each class, in words."""
+    *below, _ = shares_below(sigma)
+    return "σ " + ", ".join(f"{name} {share:.0%}" for name, share in zip(SIGMA_NAMES, below, strict=False))
