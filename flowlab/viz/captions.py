@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from flowlab.geometry.moving import MOVING_IN_EPISODE_M
 from flowlab.recordings.verdicts import stored_checks, worst_first
 from flowlab.records import Episode, PositionSource, Role
-from flowlab.text import markdown
+from flowlab.text import cut, markdown
 from flowlab.viz.stated_error import describe_shares
 
 
@@ -30,7 +30,7 @@ def caption(episode: Episode, shown: int) -> str:
 def _ending(episode: Episode) -> str:
     """When an episode was solved; of a recording, who made its tracks and how sure they are."""
     if episode.tracks.quality is not None:  # of a recording, which nobody needs to tell whether it succeeded
-        return f"tracker {tracker_name(episode)}: {sigma_summary(episode)}"
+        return f"tracker {cut(tracker_name(episode), 40)}: {sigma_summary(episode)}"
     solved = f"solved at step {int(episode.success.argmax())}" if episode.success.any() else "not solved"
     return f"{solved}   ·   exact tracks"
 

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from flowlab.viz.panels import BAR, dot
 from flowlab.viz.plot_style import LABEL_PT, QUIET, TICK_PT, hide_frame
-from flowlab.viz.stated_error import COARSE_M, SIGMA_NAMES, SIGMA_RGB, class_shares, shares_below, sigma_rgb
+from flowlab.viz.stated_error import SIGMA_NAMES, SIGMA_RGB, class_shares, is_coarse, shares_below, sigma_rgb
 
 _FAINT = 0.3
 _DARKER = 0.88
@@ -26,7 +26,7 @@ def error_trail(
     track: Float[np.ndarray, "T 2"], sigma: Float[np.ndarray, "T"], visible: Bool[np.ndarray, "T"]
 ) -> LineCollection:
     """One track in the colors of its stated errors; faint where they are large, or the point was out of sight."""
-    sure = visible[1:] & (sigma[1:] < COARSE_M)
+    sure = visible[1:] & ~is_coarse(sigma[1:])
     colors = np.column_stack([error_color(sigma[1:]), np.where(sure, 1.0, _FAINT)])
     pieces = list(np.stack([track[:-1], track[1:]], 1))
     return LineCollection(pieces, colors=list(colors), linewidths=1.6, capstyle="butt", zorder=4)
@@ -36,7 +36,7 @@ def draw_error_circles(
     axes: Axes, place: Float[np.ndarray, "K 2"], radius: Float[np.ndarray, "K"], sigma: Float[np.ndarray, "K"]
 ) -> None:
     """Circles of the radius of the stated errors, in the units of the axes, around those that are large."""
-    shown = ~(sigma < COARSE_M) & np.isfinite(radius) & np.isfinite(place).all(1)
+    shown = is_coarse(sigma) & np.isfinite(radius) & np.isfinite(place).all(1)
     size = 2 * radius[shown]
     circles = EllipseCollection(
         size, size, np.zeros(len(size)), units="x", offsets=place[shown], offset_transform=axes.transData,
@@ -48,7 +48,9 @@ def draw_error_circles(
 def error_legend(sigma: Float[np.ndarray, "T M"]) -> list[Line2D]:
     """A legend's entries of the classes of stated errors, with the share of positions below the end of each."""
     named = zip(SIGMA_NAMES, shares_below(sigma), _ON_WHITE, strict=True)
-    return [dot(f"{name}: {share:.0%}", tuple(color), "none") for name, share, color in named]
+    dots = [dot(f"{name}: {share:.0%}", tuple(color), "none") for name, share, color in named]
+    dots[0].set_label(f"σ {dots[0].get_label()}")
+    return dots
 
 
 def draw_share_bar(figure: Figure, sigma: Float[np.ndarray, "T M"]) -> None:
@@ -63,5 +65,5 @@ def draw_share_bar(figure: Figure, sigma: Float[np.ndarray, "T M"]) -> None:
     axes.set_yticks(np.linspace(0, 1, 6), [f"{x:.0%}" for x in np.linspace(0, 1, 6)])
     axes.tick_params(length=0, labelsize=TICK_PT, labelcolor=QUIET)
     axes.yaxis.set_label_position("right")
-    axes.set_ylabel("share of positions, by stated error", color=QUIET, fontsize=LABEL_PT)
+    axes.set_ylabel("share of positions, by stated error σ", color=QUIET, fontsize=LABEL_PT)
     hide_frame(axes)

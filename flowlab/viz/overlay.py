@@ -7,7 +7,7 @@ from flowlab.records import Episode, FlowPrediction, PositionSource
 from flowlab.viz.colors import PREDICTED_RGB, track_rgb
 from flowlab.viz.orientation import is_upside_down, project_upright
 from flowlab.viz.plan_predictions import PlanPrediction, plan_predictions
-from flowlab.viz.stated_error import COARSE_M, stated_sigma
+from flowlab.viz.stated_error import is_coarse, stated_sigma
 
 _RIM = (16, 18, 22)
 """Around every mark, so that it shows on any picture."""
@@ -42,7 +42,7 @@ class Overlay:
         )
         self._rgb = track_rgb(episode)
         sigma = stated_sigma(episode)
-        self._coarse = np.zeros_like(self._visible) if sigma is None else ~(sigma < COARSE_M)
+        self._coarse = np.zeros_like(self._visible) if sigma is None else is_coarse(sigma)
         self._radius = np.zeros(self._visible.shape) if sigma is None else self._error_radii(sigma)
         self._trail = trail
         self._size = max(1.0, episode.camera.width * scale / 640)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Bool, UInt8
 
 from flowlab.files import output_file
 from flowlab.geometry.moving import MOVING_IN_PLAN_M
@@ -15,17 +14,12 @@ from flowlab.records import Episode, FlowPrediction
 from flowlab.text import one_line
 from flowlab.viz.blueprint import CAMERA, CHECKS, DEPTH, INFO, RGB, make_blueprint, scene_size
 from flowlab.viz.captions import describe, describe_checks
-from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SUCCESS_RGB, cloud_rgb_at, track_rgb
+from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SUCCESS_RGB, cloud_rgb_at
 from flowlab.viz.orientation import world_is_camera_frame
 from flowlab.viz.plan_predictions import PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
-from flowlab.viz.stated_error import SIGMA_RGB
+from flowlab.viz.recorded_tracks import send_errors, send_tracks, time_columns
+from flowlab.viz.stated_error import COARSE_M, SIGMA_RGB, is_coarse, stated_sigma
 
-TRAIL_STEPS = 20
-"""A trail shows where a point was over this many steps."""
-_STILL_M = 1e-3
-"""A point that moves less than this over a whole trail [m] gets none."""
-_HIDDEN_LIGHT = 0.4
-"""Brightness of what the camera does not see, against 1 for what it sees."""
 _LEGEND = (
     "The bright yellow lines, which end in dots, are where the policy predicted the points to go when it made its last "
     f"plan, step by step; points predicted to stay within {1000 * PREDICTED_M:.0f} mm have none. The flow error is how "
@@ -51,7 +45,15 @@ def write_rrd(
         with _strict():
             recording.send_blueprint(make_blueprint(episode, flow_error=bool(errors)), make_active=False)
             recording.send_recording_name(one_line(name))
-            for send in (_send_cloud, _send_tracks, _send_camera, _send_pictures, _send_object, _send_scalars):
+            for send in (
+                _send_cloud,
+                send_tracks,
+                send_errors,
+                _send_camera,
+                _send_pictures,
+                _send_object,
+                _send_scalars,
+            ):
                 send(recording, episode)
             if plans:
                 _send_predictions(recording, episode, plans)
@@ -79,12 +81,6 @@ def _strict() -> Iterator[None]:
         rr.set_strict_mode(before)
 
 
-def _times(episode: Episode, steps: Sequence[int] | None = None) -> list[rr.TimeColumn]:
-    """The columns of some steps, or of all."""
-    rows = np.arange(len(episode)) if steps is None else np.array(steps)
-    return [rr.TimeColumn("step", sequence=rows), rr.TimeColumn("time", duration=episode.time_s[rows])]
-
-
 def _send_text(recording: rr.RecordingStream, panel: str, text: str) -> None:
     """A panel of text."""
     recording.log(panel, rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN), static=True)
@@ -96,36 +92,14 @@ def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
     points = [episode.point_cloud[t, : episode.point_count[t]] for t in steps]
     colors = [cloud_rgb_at(episode, t) for t in steps]
     columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colors))
-    recording.send_columns("/world/cloud", _times(episode), columns.partition([len(p) for p in points]))
+    recording.send_columns("/world/cloud", time_columns(episode), columns.partition([len(p) for p in points]))
     recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * scene_size(episode)), static=True)
-
-
-def _send_tracks(recording: rr.RecordingStream, episode: Episode) -> None:
-    """The query points of every step, and their trails."""
-    T, M = len(episode), episode.queries.count
-    xyz_world = episode.tracks.xyz_world[:, :M]
-    rgb = _shaded(track_rgb(episode), episode.tracks.visible[:, :M])
-    columns = rr.Points3D.columns(positions=xyz_world.reshape(-1, 3), colors=rgb.reshape(-1, 3))
-    recording.send_columns("/world/tracks/points", _times(episode), columns.partition([M] * T))
-    recording.log("/world/tracks/points", rr.Points3D.from_fields(radii=0.005 * scene_size(episode)), static=True)
-
-    windows = [xyz_world[max(0, t - TRAIL_STEPS) : t + 1] for t in range(T)]
-    moved = np.array([np.linalg.norm(np.ptp(w, axis=0), axis=-1) > _STILL_M for w in windows])
-    strips = [w[:, k] for w, moving in zip(windows, moved, strict=True) for k in np.flatnonzero(moving)]
-    lines = rr.LineStrips3D.columns(strips=strips, colors=rgb[moved])
-    recording.send_columns("/world/tracks/trails", _times(episode), lines.partition(moved.sum(1)))
-    recording.log("/world/tracks/trails", rr.LineStrips3D.from_fields(radii=0.0012 * scene_size(episode)), static=True)
-
-
-def _shaded(rgb: UInt8[np.ndarray, "T M 3"], visible: Bool[np.ndarray, "T M"]) -> UInt8[np.ndarray, "T M 3"]:
-    """The colors at every step, darker where the camera does not see the point."""
-    return (rgb * np.where(visible, 1.0, _HIDDEN_LIGHT)[..., None]).astype(np.uint8)
 
 
 def _send_predictions(recording: rr.RecordingStream, episode: Episode, plans: Sequence[PlanPrediction]) -> None:
     """The paths that each plan predicts; one that predicts none clears those of the plan before."""
     drawn = [plan.predicted_world[:, plan.predicted_moving].swapaxes(0, 1) for plan in plans]
-    times = _times(episode, [plan.step for plan in plans])
+    times = time_columns(episode, [plan.step for plan in plans])
     counts = [len(paths) for paths in drawn]
     strips = rr.LineStrips3D.columns(strips=[path for paths in drawn for path in paths])
     ends = rr.Points3D.columns(positions=np.concatenate([paths[:, -1] for paths in drawn]))
@@ -146,7 +120,7 @@ def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
     else:
         T = episode.T_world_cam
         columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
-        recording.send_columns(CAMERA, _times(episode), columns)
+        recording.send_columns(CAMERA, time_columns(episode), columns)
         recording.log("/world/camera_path", rr.LineStrips3D([T[:, :3, 3]], colors=SERIES_RGB[-1]), static=True)
     pinhole = rr.Pinhole(
         image_from_camera=camera.K,
@@ -168,11 +142,11 @@ def _send_pictures(recording: rr.RecordingStream, episode: Episode) -> None:
         style = rr.DepthImage.from_fields(format=form, meter=1000.0, depth_range=limits, colormap="viridis")
         recording.log(DEPTH, style, static=True)
         buffers = depth_mm.reshape(T, -1).view(np.uint8)
-        recording.send_columns(DEPTH, _times(episode), rr.DepthImage.columns(buffer=buffers))
+        recording.send_columns(DEPTH, time_columns(episode), rr.DepthImage.columns(buffer=buffers))
     if episode.rgb is not None:
         form = rr.components.ImageFormat(**resolution, color_model="RGB", channel_datatype=rr.ChannelDatatype.U8)
         recording.log(RGB, rr.Image.from_fields(format=form), static=True)
-        recording.send_columns(RGB, _times(episode), rr.Image.columns(buffer=episode.rgb.reshape(T, -1)))
+        recording.send_columns(RGB, time_columns(episode), rr.Image.columns(buffer=episode.rgb.reshape(T, -1)))
 
 
 def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
@@ -181,7 +155,7 @@ def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:
         return
     R_world_object = rotation_from_6d(episode.object_pose[:, 3:])
     columns = rr.Transform3D.columns(translation=episode.object_pose[:, :3], mat3x3=R_world_object)
-    recording.send_columns("/world/object", _times(episode), columns)
+    recording.send_columns("/world/object", time_columns(episode), columns)
     recording.log("/world/object", rr.TransformAxes3D(0.08 * scene_size(episode)), static=True)
 
 
@@ -192,13 +166,13 @@ def _send_scalars(recording: rr.RecordingStream, episode: Episode) -> None:
             color = SERIES_RGB[k % len(SERIES_RGB)]
             _send_line(recording, episode, f"{group}/{k}", column, name=f"{group} {k}", color=color)
     _send_line(recording, episode, "success", episode.success.astype(float), name="success", color=SUCCESS_RGB)
-    if episode.tracks.quality is not None:
-        M = episode.queries.count
-        median, p90 = np.percentile(1000 * episode.tracks.quality.sigma[:, :M], [50, 90], axis=1)
-        seen = 100 * episode.tracks.visible[:, :M].mean(1)
+    if (sigma := stated_sigma(episode)) is not None:
+        median, p90 = np.percentile(1000 * sigma, [50, 90], axis=1)
+        seen = 100 * episode.tracks.visible[:, : episode.queries.count].mean(1)
         for key, values, name, color in [
             ("sigma_median", median, "σ median [mm]", SIGMA_RGB[0]),
             ("sigma_p90", p90, "σ 90th percentile [mm]", SIGMA_RGB[3]),
+            ("sigma_below", 100 * (~is_coarse(sigma)).mean(1), f"σ < {1000 * COARSE_M:.0f} mm [%]", SERIES_RGB[0]),
             ("visible", seen, "in sight [%]", SUCCESS_RGB),
         ]:
             _send_line(recording, episode, f"quality/{key}", values, name=name, color=color)
@@ -223,4 +197,4 @@ def _send_line(
 ) -> None:
     """One line of a plot: a value for each of some steps, or of all."""
     recording.log(f"/scalars/{key}", rr.SeriesLines(names=name, colors=color, widths=1.5), static=True)
-    recording.send_columns(f"/scalars/{key}", _times(episode, steps), rr.Scalars.columns(scalars=values))
+    recording.send_columns(f"/scalars/{key}", time_columns(episode, steps), rr.Scalars.columns(scalars=values))

@@ -1,13 +1,13 @@
 """Stated errors as colors, classes and shares: the same in films, stills and recordings."""
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from flowlab.records import Episode
 
 SIGMA_STEPS_M = (0.005, 0.01, 0.02, 0.05)
 """Stated errors are shown in classes that end below these [m], and a last one without end."""
-SIGMA_RGB = ((128, 246, 231), (236, 208, 40), (245, 138, 20), (228, 44, 50), (150, 28, 110))
+SIGMA_RGB = ((128, 246, 231), (228, 196, 20), (245, 138, 20), (228, 44, 50), (150, 28, 110))
 """sRGB of the classes: the larger the error, the darker. Told apart by color-blind people, and in gray."""
 SIGMA_NAMES = ("< 5 mm", "< 10 mm", "< 20 mm", "< 50 mm", "≥ 50 mm")
 COARSE_M = 0.02
@@ -17,7 +17,12 @@ _PALETTE = np.array(SIGMA_RGB, np.uint8)
 
 def sigma_class(sigma: Float[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
     """The class of each stated error [m], counted from 0; what is not a number is in the last."""
-    return np.digitize(sigma, SIGMA_STEPS_M)
+    return np.digitize(sigma.astype(np.float32), np.array(SIGMA_STEPS_M, np.float32))
+
+
+def is_coarse(sigma: Float[np.ndarray, "*batch"]) -> Bool[np.ndarray, "*batch"]:
+    """Which stated errors [m] are so large that they are drawn as unsure."""
+    return ~(sigma.astype(np.float32) < np.float32(COARSE_M))
 
 
 def sigma_rgb(sigma: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch 3"]:

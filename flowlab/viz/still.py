@@ -106,7 +106,7 @@ def _draw_scene(
     fit_limits(axes, np.concatenate([cloud, tracks.reshape(-1, 2)]), margin)
     draw_cloud(axes, cloud, depth, cloud_rgb_at(episode, 0))
     still = ~moving(episode)
-    axes.scatter(*tracks[0, still].T, 6, c=_ink(episode)[still], linewidths=0, zorder=3)
+    axes.scatter(tracks[0, still, 0], tracks[0, still, 1], 6, c=_ink(episode)[still], linewidths=0, zorder=3)
     if sigma is None:
         _draw_exact_trails(axes, episode, tracks)
     else:
@@ -116,11 +116,11 @@ def _draw_scene(
 def _draw_exact_trails(axes: Axes, episode: Episode, tracks: Float[np.ndarray, "T M 2"]) -> None:
     """The trails of points that move, colored by time."""
     drawn = _drawn_trails(episode)
+    (start_u, start_v), (end_u, end_v) = tracks[0, drawn].T, tracks[-1, drawn].T
     for k in drawn:
         axes.add_collection(trail_lines(tracks[:, k]), autolim=False)
-    edges = _ink(episode)[drawn]
-    axes.scatter(*tracks[0, drawn].T, 14, c="white", edgecolors=edges, linewidths=1, zorder=5)
-    axes.scatter(*tracks[-1, drawn].T, 17, color=TIME_COLORS(1.0), edgecolors="white", linewidths=0.6, zorder=6)
+    axes.scatter(start_u, start_v, 14, c="white", edgecolors=_ink(episode)[drawn], linewidths=1, zorder=5)
+    axes.scatter(end_u, end_v, 17, color=TIME_COLORS(1.0), edgecolors="white", linewidths=0.6, zorder=6)
 
 
 def _draw_estimated_trails(
@@ -135,13 +135,11 @@ def _draw_estimated_trails(
     for k in drawn:
         axes.add_collection(error_trail(tracks[:, k], sigma[:, k], visible[:, k]), autolim=False)
     draw_error_circles(axes, tracks[-1, drawn], sigma[-1, drawn] * unit[drawn], sigma[-1, drawn])
-    axes.scatter(*tracks[0, drawn].T, 10, c="white", edgecolors=QUIET, linewidths=0.8, zorder=5)
-    for ends, size, faces in ((drawn[visible[-1, drawn]], 20, None), (drawn[~visible[-1, drawn]], 16, "white")):
-        ink = error_color(sigma[-1, ends])
-        edges = "white" if faces is None else ink
-        axes.scatter(
-            *tracks[-1, ends].T, size, c=ink if faces is None else faces, edgecolors=edges, linewidths=1, zorder=6
-        )
+    (start_u, start_v), (end_u, end_v) = tracks[0, drawn].T, tracks[-1, drawn].T
+    axes.scatter(start_u, start_v, 10, c="white", edgecolors=QUIET, linewidths=0.8, zorder=5)
+    seen, ink = visible[-1, drawn], error_color(sigma[-1, drawn])
+    axes.scatter(end_u[seen], end_v[seen], 20, c=ink[seen], edgecolors="white", linewidths=1, zorder=6)
+    axes.scatter(end_u[~seen], end_v[~seen], 16, c="white", edgecolors=ink[~seen], linewidths=1, zorder=6)
 
 
 def _ink(episode: Episode) -> Float[np.ndarray, "M 3"]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection
 from matplotlib.image import imread
 from rerun.chunk import RrdReader
 from synthetic import (
@@ -29,9 +30,11 @@ from flowlab.storage.receipts import Reject, shard_path
 from flowlab.storage.shard import write_shard
 from flowlab.viz.blueprint import make_blueprint
 from flowlab.viz.captions import caption, describe, moving
-from flowlab.viz.colors import ROLE_RGB, UNKNOWN, cloud_rgb_at, sigma_rgb
+from flowlab.viz.colors import ROLE_RGB, UNKNOWN, cloud_rgb_at
 from flowlab.viz.orientation import up_from_world
-from flowlab.viz.recording import TRAIL_STEPS, write_rrd
+from flowlab.viz.recorded_tracks import TRAIL_STEPS
+from flowlab.viz.recording import write_rrd
+from flowlab.viz.stated_error import sigma_rgb
 from flowlab.viz.still import TIME_COLORS, draw_still, plot_still
 
 T, P, M, DISTINCT_POINTS, DISTINCT_QUERIES = 30, 50, 8, 40, 6
@@ -310,11 +313,12 @@ def test_error_and_visibility_are_plotted_over_time(real: Episode, tmp_path: Pat
     found = recorded(replace(real, tracks=tracks), tmp_path)
     read = {
         key: np.ravel(found[f"/scalars/quality/{key}", "Scalars:scalars"])
-        for key in ("sigma_median", "sigma_p90", "visible")
+        for key in ("sigma_median", "sigma_p90", "sigma_below", "visible")
     }
     in_order = 1000 * np.sort(sigma[:, :5], 1)  # the sixth repeats one of them
     np.testing.assert_allclose(read["sigma_median"], in_order[:, 2], rtol=1e-5)
     np.testing.assert_allclose(read["sigma_p90"], 0.4 * in_order[:, 3] + 0.6 * in_order[:, 4], rtol=1e-5)
+    np.testing.assert_allclose(read["sigma_below"], 100 * (sigma[:, :5] < 0.02).mean(1), rtol=1e-5)
     np.testing.assert_allclose(read["visible"], 100 * visible[:, :5].sum(1) / 5, rtol=1e-5)
     kinds = [rows[0][0] for (_, name), rows in columns(tmp_path / "e.rrd", True).items() if "class_id" in name]
     assert kinds.count("TimeSeries") == 3
@@ -341,8 +345,10 @@ def test_info_says_who_tracked_and_how_well(real: Episode) -> None:
         "| stated error | σ median 20 mm, p90 60 mm |",
     ):
         assert row in text
-    assert "40 mm and more" in text
-    assert "σ median 20 mm" in caption(real, 1)
+    assert r"| stated below | σ \< 5 mm 20%, \< 10 mm 20%, \< 20 mm 20%, \< 50 mm 80% |" in text
+    assert "tracker rigid-bodies: σ median 20 mm" in caption(real, 1)
+    assert "exact" not in caption(real, 1)
+    assert "exact tracks" in caption(replace(real, tracks=replace(real.tracks, quality=None)), 1)
     assert "tracker" not in describe(replace(real, tracks=replace(real.tracks, quality=None)))
     nobody = describe(replace(real, extras={}))
     assert "| tracker | not known |" in nobody
@@ -429,11 +435,40 @@ def test_stills_of_recordings_are_upright(real: Episode) -> None:
 def test_stills_of_recordings_show_the_error(real: Episode, tmp_path: Path) -> None:
     image = picture(real, tmp_path / "e.png")
     for k in (2, 3):  # those that stand still have dots only
-        expected = 0.8 * sigma_rgb(np.array([0.02]))[0]
+        expected = 0.88 * sigma_rgb(np.array([0.02]))[0]
         uv, _ = real.camera.project(real.tracks.xyz_world[0, k])
         assert np.abs(colors_at(image, real, 0, uv) - expected).max(-1).min() < 12
-    texts = [text.get_text() for text in plot_still(real, "pour").legends[0].get_texts()]
-    assert texts == ["σ = 0 mm", "σ = 20 mm", "≥ 40 mm", "start", "end"]
+    figure = plot_still(real, "pour")
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[:5] == ["σ < 5 mm: 20%", "< 10 mm: 20%", "< 20 mm: 20%", "< 50 mm: 80%", "≥ 50 mm: 20%"]
+    assert texts[5:] == ["start", "end", "end, out of sight", "radius σ ≥ 20 mm"]
+    np.testing.assert_allclose([bar.get_height() for bar in figure.axes[2].patches], [0.2, 0, 0, 0.6, 0.2])
+
+
+def test_trails_of_recordings_are_colored_by_error_and_faint_where_it_is_large(real: Episode) -> None:
+    assert real.tracks.quality is not None
+    sigma = real.tracks.quality.sigma.copy()
+    sigma[:, 0] = [0.001] * 4 + [0.007] * 4 + [0.03] * 4
+    tracks = replace(real.tracks, quality=replace(real.tracks.quality, sigma=sigma))
+    camera, side = plot_still(replace(real, tracks=tracks), "pour").axes[:2]
+    for axes, unit in ((camera, real.camera.K[0, 0]), (side, 1.0)):
+        trail, circles = axes.collections[2:4]
+        found = np.asarray(trail.get_edgecolor())
+        np.testing.assert_allclose(found[:, :3], 0.88 * sigma_rgb(sigma[1:, 0]) / 255)
+        np.testing.assert_allclose(found[:, 3], [1.0] * 7 + [0.3] * 4)
+        assert isinstance(circles, EllipseCollection)
+        np.testing.assert_allclose(circles.get_widths(), [2 * 0.03 * unit], rtol=1e-3)
+    sure = replace(real.tracks.quality, sigma=np.full_like(sigma, 0.001))
+    camera = plot_still(replace(real, tracks=replace(tracks, quality=sure)), "pour").axes[0]
+    (circles,) = [c for c in camera.collections if isinstance(c, EllipseCollection)]
+    assert len(circles.get_widths()) == 0
+
+
+def test_large_stated_errors_are_spheres_in_the_recording(real: Episode, tmp_path: Path) -> None:
+    half_sizes = recorded(real, tmp_path)["/world/tracks/errors", "Ellipsoids3D:half_sizes"]
+    np.testing.assert_allclose(half_sizes[0], np.repeat([[0.06], [0.02], [0.02], [0.02]], 3, axis=1))
+    exact = replace(real, tracks=replace(real.tracks, quality=None))
+    assert ("/world/tracks/errors", "Ellipsoids3D:half_sizes") not in recorded(exact, tmp_path)
 
 
 def test_a_note_stands_in_the_still(real: Episode) -> None:

@@ -11,13 +11,15 @@ from synthetic import ENTITIES, LOOKING_ALONG_Y, make_episode, make_filmed_episo
 
 from flowlab.errors import DataError
 from flowlab.records import Episode, Role
-from flowlab.viz.colors import ROLE_RGB, SIGMA_RGB, sigma_rgb
+from flowlab.viz.caption_bar import CaptionBar
+from flowlab.viz.colors import ROLE_RGB
 from flowlab.viz.overlay import Overlay
+from flowlab.viz.stated_error import SIGMA_RGB, describe_shares, is_coarse, shares_below, sigma_rgb
 from flowlab.viz.video import write_video
 
 SCALE = 8  # 80 pixels wide becomes 640
 GRAY = (128, 128, 128)
-GOOD, MIDDLE, BAD = (np.array(rgb, float) for rgb in SIGMA_RGB)
+GOOD, _, _, MIDDLE, BAD = (np.array(rgb, float) for rgb in SIGMA_RGB)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,7 @@ def test_a_film_has_the_form_that_browsers_play(episode: Episode, tmp_path: Path
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
         assert stream.average_rate == Fraction(10)
         assert stream.frames == len(episode)
-        assert (stream.width, stream.height) == (640, 564)
+        assert (stream.width, stream.height) == (640, 598)
         assert float(stream.duration * stream.time_base) == pytest.approx(1.2)
     content = (tmp_path / "e.mp4").read_bytes()
     assert 0 < content.find(b"moov") < content.find(b"mdat")  # so that it plays before it has all arrived
@@ -144,11 +146,64 @@ def test_exact_tracks_are_colored_by_role(tmp_path: Path) -> None:
     assert shows(film[4], *center(60, 14), ROLE_RGB[Role.OBJECT])
 
 
-def test_stated_errors_have_a_fixed_scale() -> None:
-    found = sigma_rgb(np.array([0, 0.02, 0.04, 0.4, np.inf, np.nan]))
-    np.testing.assert_array_equal(found, [GOOD, MIDDLE, BAD, BAD, BAD, BAD])
-    between = sigma_rgb(np.array([0.01]))[0].astype(float)
-    np.testing.assert_allclose(between, (GOOD + MIDDLE) / 2, atol=0.51)
+def test_stated_errors_have_the_same_classes_everywhere() -> None:
+    sigma = np.array([0, 0.0049, 0.005, 0.012, 0.02, 0.049, 0.05, 0.4, np.inf, np.nan], np.float32)
+    expected = [0, 0, 1, 2, 3, 3, 4, 4, 4, 4]
+    np.testing.assert_array_equal(sigma_rgb(sigma), np.array(SIGMA_RGB)[expected])
+    np.testing.assert_array_equal(is_coarse(sigma), np.array(expected) >= 3)
+    np.testing.assert_allclose(shares_below(sigma), [0.2, 0.3, 0.4, 0.6, 0.4])
+    assert describe_shares(sigma) == "σ < 5 mm 20%, < 10 mm 30%, < 20 mm 40%, < 50 mm 60%"
+
+
+def oklab(linear_rgb: np.ndarray) -> np.ndarray:
+    """Colors in Ottosson's space, where equal distances look equal; lightness first."""
+    to_lms = [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+    to_lab = [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+    return np.cbrt(linear_rgb.clip(0, 1) @ np.transpose(to_lms)) @ np.transpose(to_lab)
+
+
+@pytest.mark.parametrize(
+    "seen",  # Machado et al. 2009, severity 1, on linear RGB
+    [
+        pytest.param(np.eye(3), id="all colors"),
+        pytest.param([[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.052]], id="no red"),
+        pytest.param([[0.3673, 0.8606, -0.228], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]], id="no green"),
+        pytest.param([[1.2555, -0.0767, -0.1788], [-0.0784, 0.9308, 0.1476], [0.0047, 0.6914, 0.3039]], id="no blue"),
+    ],
+)
+def test_color_blind_people_can_tell_the_classes_apart(seen: list[list[float]]) -> None:
+    linear = ((np.array(SIGMA_RGB) / 255 + 0.055) / 1.055) ** 2.4
+    lab = oklab(linear @ np.transpose(seen))
+    assert (np.diff(lab[:, 0]) < -0.03).all(), "the larger the error, the darker"
+    distance = np.linalg.norm(lab[:, None] - lab, axis=-1)
+    assert distance[~np.eye(len(lab), dtype=bool)].min() > 0.09
+
+
+def test_a_large_stated_error_is_a_circle_of_its_size_and_makes_trails_faint(episode: Episode, tmp_path: Path) -> None:
+    assert episode.tracks.quality is not None
+    sigma = episode.tracks.quality.sigma.copy()
+
+    def at_step_8(of_first: float) -> np.ndarray:
+        sigma[:, 0] = of_first
+        tracks = replace(episode.tracks, quality=replace(episode.tracks.quality, sigma=sigma))
+        return filmed(replace(episode, tracks=tracks), tmp_path, trail_s=0.3)[8]
+
+    large, small = at_step_8(0.03), at_step_8(0.019)
+    row, column = center(28, 12)
+    radius = 0.03 * episode.camera.K[0, 0] * SCALE  # 1 m away
+    for picture, rim in ((large, True), (small, False)):
+        strongest = np.abs(picture[round(row - radius) - 2 : round(row - radius) + 3, round(column)] - GRAY).max()
+        assert (strongest > 40) == rim
+    trail = row, column - 1.6 * SCALE
+    assert np.abs(color(small, *trail) - GRAY).max() > 1.5 * np.abs(color(large, *trail) - GRAY).max()
 
 
 def test_without_color_the_depth_is_shown_in_gray(episode: Episode, tmp_path: Path) -> None:
@@ -181,7 +236,7 @@ def test_what_a_hanging_camera_films_is_turned_upright(tmp_path: Path) -> None:
     np.testing.assert_allclose(filmed(hanging, tmp_path), filmed(upright, tmp_path), atol=1)
 
 
-@pytest.mark.parametrize(("width", "height", "expected"), [(641, 481, (642, 566)), (1280, 720, (1280, 888))])
+@pytest.mark.parametrize(("width", "height", "expected"), [(641, 481, (642, 598)), (1280, 720, (1280, 954))])
 def test_wide_pictures_keep_their_size_and_odd_ones_become_even(
     width: int, height: int, expected: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -220,16 +275,25 @@ def test_points_far_outside_do_no_harm(episode: Episode, tmp_path: Path) -> None
 def test_the_strip_says_whose_film_it_is_and_how_far(episode: Episode, film: np.ndarray, tmp_path: Path) -> None:
     noted = filmed(episode, tmp_path, trail_s=0.3, title="another", note="rejected at quality: " + "too poor " * 15)
     assert noted.shape[1] == film.shape[1] + 2 * 18
-    red = (noted[5, 564:, :, 0] - noted[5, 564:, :, 2] > 30).sum()
+    red = (noted[5, 597:, :, 0] - noted[5, 597:, :, 2] > 30).sum()
     assert red > 300
-    title = np.s_[490:515, :300]
+    title = np.s_[500:525, :300]
     assert np.abs(noted[5][title] - film[5][title]).max() > 100
-    bar = film[5, 482, :]
-    assert np.abs(bar[100] - MIDDLE).max() < 25  # median of the five stated errors, 20 mm
-    assert bar[500].max() < 0.5 * bar[100].max()
-    scale = film[0, 549, 430:571]
-    for column, expected in ((3, GOOD), (70, MIDDLE), (137, BAD)):
-        assert np.abs(scale[column] - expected).max() < 35
+    shares = film[5, 480:494]  # of five points one is below 5 mm, three are below 50
+    for y, expected in ((12, GOOD), (6, MIDDLE), (1, BAD)):
+        assert np.abs(shares[y, 100] - expected).max() < 40
+        assert shares[y, 500].max() < 0.5 * shares[y, 100].max()
+    for k, expected in enumerate(SIGMA_RGB):
+        assert shows(film[0], 582, 112 + 106 * k, expected, 40)
+
+
+def test_the_strip_of_exact_tracks_says_so(episode: Episode) -> None:
+    exact = replace(episode, tracks=replace(episode.tracks, quality=None))
+    assert CaptionBar(exact, 640, "pour", "").draw(0).shape == (84, 640, 3)
+    for shown, words in ((exact, "exact tracks"), (episode, "tracker rigid-bodies")):
+        texts = [text.get_text() for text in CaptionBar(shown, 640, "pour", "")._figure.texts]
+        assert words in texts
+        assert ("stated error σ" in texts) == (shown is episode)
 
 
 def test_a_failure_leaves_the_old_film_alone(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
