@@ -7,7 +7,7 @@ from flowlab.records import Episode
 
 SIGMA_STEPS_M = (0.005, 0.01, 0.02, 0.05)
 """Stated errors are shown in classes that end below these [m], and a last one without end."""
-SIGMA_RGB = ((128, 246, 231), (228, 196, 20), (245, 138, 20), (228, 44, 50), (150, 28, 110))
+SIGMA_RGB = ((128, 246, 231), (229, 204, 28), (242, 134, 8), (228, 44, 50), (150, 28, 110))
 """sRGB of the classes: the larger the error, the darker. Told apart by color-blind people, and in gray."""
 SIGMA_NAMES = ("< 5 mm", "< 10 mm", "< 20 mm", "< 50 mm", "≥ 50 mm")
 COARSE_M = 0.02
