@@ -94,7 +94,7 @@ def grade(
         on_progress=lambda text: None if as_json else say(text),
     )
     picture = out / "grade.png"
-    draw_grades({t.name: t.mean for t in report.trackers}, picture, title="error of tracks", about=report.about)
+    draw_grades({t.name: t.mean for t in report.trackers}, picture, graded=report.graded, about=report.about)
     if as_json:
         print_json(report.to_json())
         return

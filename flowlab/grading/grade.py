@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from flowlab.errors import DataError
 from flowlab.grading import ground_truth
 from flowlab.grading.calibration import Calibration, calibrate
-from flowlab.grading.ground_truth import GroundTruth, scene_of, unusable_queries
+from flowlab.grading.ground_truth import GroundTruth, unusable_queries
 from flowlab.grading.metrics import (
     EstimatedTracks,
     TrackMetrics,
@@ -20,6 +20,7 @@ from flowlab.grading.metrics import (
     errors_m,
     measure,
 )
+from flowlab.grading.origin import Origin, origin_of
 from flowlab.grading.tapvid import MetricSettings
 from flowlab.recordings.recording import RecordingSettings, open_recording
 from flowlab.records import Clip
@@ -37,8 +38,9 @@ class RecordingGrade:
     """One recording, labeled by one tracker."""
 
     recording: str
-    scene: str
-    """The family of procedural scenes or the task that it is of; empty for a recording of somebody's own."""
+    origin: Origin
+    size: tuple[int, int]
+    """Width and height of its pictures [px]."""
     frames: int
     queries: int
     unusable_queries: int
@@ -50,15 +52,21 @@ class RecordingGrade:
     metrics: TrackMetrics
 
     @property
+    def scene(self) -> str:
+        """The family of procedural scenes or the task that it is of; empty for a recording of somebody's own."""
+        return self.origin.scene
+
+    @property
     def ms_per_frame(self) -> float:
         """CPU time per frame [ms]."""
         return self.cpu_s / self.frames * 1e3
 
     def to_json(self) -> dict[str, Any]:
         """The figures, without the tracks, as JSON values."""
-        facts = {name: getattr(self, name) for name in ("recording", "scene", "frames", "queries", "unusable_queries")}
+        made = {"recording": self.recording, **asdict(self.origin), "size": list(self.size)}
+        facts = {name: getattr(self, name) for name in ("frames", "queries", "unusable_queries")}
         times = {"cpu_s": round(self.cpu_s, 3), "ms_per_frame": round(self.ms_per_frame, 2)}
-        return {**facts, **times, "metrics": self.metrics.to_json()}
+        return {**made, **facts, **times, "metrics": self.metrics.to_json()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +150,8 @@ def grade_recording(
     cpu_s = time.process_time() - start
     return RecordingGrade(
         recording=recording.name,
-        scene=scene_of(recording),
+        origin=origin_of(recording),
+        size=(clip.camera.width, clip.camera.height),
         frames=len(clip),
         queries=len(truth.query_px),
         unusable_queries=unusable_queries(recording),

@@ -11,6 +11,7 @@ from flowlab.errors import FlowlabError, UsageError, unknown_name
 from flowlab.files import write_json
 from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_tracker
 from flowlab.grading.ground_truth import find_with_truth
+from flowlab.grading.origin import seeds_in_words, sizes_in_words
 from flowlab.sim.loading import load_mujoco
 from flowlab.tracking.base import Tracker, make_tracker
 from flowlab.tracking.chunking import ChunkSettings
@@ -31,11 +32,26 @@ class GradingReport:
     trackers: tuple[TrackerGrade, ...]
 
     @property
-    def about(self) -> str:
-        """How much was graded, in words."""
+    def graded(self) -> tuple[str, ...]:
+        """What the tracks are of: tasks and families of scenes, and the names of recordings of somebody's own."""
+        return tuple(dict.fromkeys(row.scene or row.recording for row in self.trackers[0].rows))
+
+    @property
+    def about(self) -> tuple[str, ...]:
+        """How much was graded, and what it was recorded with, in words."""
         rows = self.trackers[0].rows
         frames, queries = sum(r.frames for r in rows), sum(r.queries for r in rows)
-        return f"{len(rows)} recordings, {frames} frames, {queries} query points"
+        seeds = seeds_in_words([row.origin.seed for row in rows if row.origin.seed is not None])
+        simulated = ", ".join(dict.fromkeys(row.origin.sensor for row in rows if row.origin.sensor))
+        sensors = [f"simulated sensor: {simulated}"] if simulated else []
+        if not all(row.origin.sensor for row in rows):
+            sensors.append("sensor of own recordings not stated")
+        return (
+            f"{len(rows)} recording{'s' if len(rows) > 1 else ''}" + (f" ({seeds})" if seeds else ""),
+            f"{frames} frames, {queries} query points",
+            *sensors,
+            sizes_in_words([row.size for row in rows]),
+        )
 
     def to_json(self) -> dict[str, Any]:
         """All figures and the settings they were taken with, as JSON values."""

@@ -1,19 +1,22 @@
 """Grades as one picture: how errors are distributed, and whether stated errors can be believed."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
 
-from flowlab.grading.calibration import Calibration
+from flowlab.grading.calibration import CONFIDENTLY_WRONG, Calibration
 from flowlab.grading.metrics import CURVE_MM, TrackMetrics
 from flowlab.viz.plot_style import (
     INK,
     QUIET,
     SERIES,
+    fit_names,
+    fit_text,
     label_text,
     new_figure,
     plain_style,
@@ -31,24 +34,35 @@ GROUPS = {
 """The panels of error curves, as far as there are such points."""
 RELIABILITY_POINTS = 30
 """Bins with fewer pairs are not drawn: their percentile would be chance."""
-_PANEL_IN = 3.3
+_PANEL_IN, _AXES_IN, _ABOVE_IN, _MARGIN_IN = 3.3, 2.9, 1.18, 0.15
+"""Width of a panel with its margin, height of its axes, room for the title, empty edges."""
+_LINE_IN, _WORDS_IN = 0.22, 0.18
+"""Height of a tracker's line, and of the middle of the line below all of them."""
+_TITLE_PT = 13.0
 _TICKS_MM = (1, 5, 10, 20, 40, 100, 500)
 _SIGMA_TICKS_MM = (1, 2, 5, 10, 20, 50, 100)
 
 
-def draw_grades(metrics: Mapping[str, TrackMetrics], path: Path, *, title: str, about: str = "") -> None:
+def draw_grades(
+    metrics: Mapping[str, TrackMetrics], path: Path, *, graded: Sequence[str], about: Sequence[str] = ()
+) -> None:
     """Write a PNG for the mean metrics of each tracker, by name. ``path`` is either absent, as before, or whole."""
-    save_png(plot_grades(metrics, title, about), path)
+    save_png(plot_grades(metrics, graded, about), path)
 
 
 @plain_style()
-def plot_grades(metrics: Mapping[str, TrackMetrics], title: str, about: str = "") -> Figure:
+def plot_grades(metrics: Mapping[str, TrackMetrics], graded: Sequence[str], about: Sequence[str] = ()) -> Figure:
     """The figure of :func:`draw_grades`: a panel of cumulative error curves for each group there is, then the
-    reliability of sigma, if any is stated; a line for each tracker."""
+    reliability of sigma, if any is stated; a line for each tracker.
+
+    ``graded`` names the tasks, families of scenes or recordings, ``about`` says with what they were recorded.
+    """
     groups = [g for g in GROUPS if any(getattr(m, g) is not None for m in metrics.values())]
     stated = any(m.calibration is not None for m in metrics.values())
     panels = len(groups) + stated
-    figure = new_figure(max(panels, 2) * _PANEL_IN + 0.4, 4.6)
+    width, below = max(panels, 2) * _PANEL_IN + 0.4, 0.8 + _LINE_IN * len(metrics)
+    height = _ABOVE_IN + _AXES_IN + below
+    figure = new_figure(width, height)
     colors = {name: SERIES[k % len(SERIES)] for k, name in enumerate(metrics)}
     axes = figure.subplots(1, max(panels, 1), squeeze=False)[0]
     for panel, group in zip(axes, groups, strict=False):
@@ -56,18 +70,33 @@ def plot_grades(metrics: Mapping[str, TrackMetrics], title: str, about: str = ""
     if stated:
         _draw_reliability(axes[-1], {n: m.calibration for n, m in metrics.items() if m.calibration}, colors)
     axes[0].set_ylabel("share of points and frames", color=QUIET, fontsize=9)
-    width, height = figure.get_size_inches()
-    figure.subplots_adjust(0.6 / width, 0.78 / height, 1 - 0.15 / width, 1 - 0.92 / height, wspace=0.22)
-    set_title(figure, title)
-    figure.text(
-        1 - 0.15 / width, 0.2 / height, label_text(about, 120), fontsize=9, color=QUIET, va="center", ha="right"
-    )
-    lines = [Line2D([], [], color=color, linewidth=2.2, label=label_text(name)) for name, color in colors.items()]
-    figure.legend(
-        handles=lines, loc="lower left", bbox_to_anchor=(0.15 / width, 0.08 / height), ncols=len(lines),
-        frameon=False, fontsize=9.5, labelcolor=INK, handlelength=1.4, borderpad=0, borderaxespad=0,
-    )  # fmt: skip
+    figure.subplots_adjust(0.6 / width, below / height, 1 - 0.15 / width, 1 - _ABOVE_IN / height, wspace=0.22)
+    _write_title(figure, graded, about)
+    _write_trackers(figure, metrics, colors)
     return figure
+
+
+def _write_title(figure: Figure, graded: Sequence[str], about: Sequence[str]) -> None:
+    """What was graded, and what it was recorded with, at the top, as far as it fits."""
+    width, height = figure.get_size_inches()
+    room, bold = width - 2 * _MARGIN_IN, FontProperties(size=_TITLE_PT, weight="bold")
+    set_title(figure, fit_names(figure, "error of tracks: ", graded, room, bold), size=_TITLE_PT)
+    facts = fit_text(figure, label_text("   ·   ".join(about), 1000), room, FontProperties(size=9))
+    figure.text(_MARGIN_IN / width, 1 - 0.62 / height, facts, fontsize=9, color=QUIET, va="center")
+
+
+def _write_trackers(figure: Figure, metrics: Mapping[str, TrackMetrics], colors: Mapping[str, str]) -> None:
+    """A line for each tracker at the bottom: its color, its name, and how often it is confidently wrong."""
+    (width, height), left, font = figure.get_size_inches(), _MARGIN_IN, FontProperties(size=9.5)
+    for k, (name, of_tracker) in enumerate(metrics.items()):
+        y, wrong = (_WORDS_IN + _LINE_IN * (len(metrics) - k)) / height, of_tracker.confidently_wrong
+        says = ": states no errors" if wrong is None or np.isnan(wrong) else f": {wrong:.2%} confidently wrong"
+        text = fit_text(figure, label_text(name), width - left - 0.6, font, end=says)
+        figure.add_artist(Line2D([left / width, (left + 0.22) / width], [y, y], color=colors[name], linewidth=2.2))
+        figure.text((left + 0.3) / width, y, text, fontsize=9.5, color=INK, va="center")
+    least_m, sigmas = CONFIDENTLY_WRONG
+    words = f"confidently wrong: in sight, true error above {1000 * least_m:.0f} mm and above {sigmas:.0f} σ"
+    figure.text(left / width, _WORDS_IN / height, words, fontsize=9, color=QUIET, va="center")
 
 
 def _draw_curves(axes: Axes, group: str, metrics: Mapping[str, TrackMetrics], colors: Mapping[str, str]) -> None:

@@ -2,14 +2,17 @@
 
 import colorsys
 import warnings
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, cast
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 
 from flowlab.files import output_file
 from flowlab.text import cut
@@ -27,6 +30,8 @@ _PAPER_COLORS = {
     "fdp-stratified": PINK, "fdp-auxiliary": "#8a7a5c",
 }  # fmt: skip
 _FURTHER = ("#c2453d", "#2a9aa8", "#6b7a2e", "#a05a2c", "#5b6ee0", "#4a4f57")
+_MOST_NAMES = 40
+"""No line holds more."""
 _LONGEST_LABEL = 60
 """Characters of a name in a figure, which grows with its longest."""
 _GOLDEN = 0.61803398875
@@ -71,6 +76,35 @@ def set_title(figure: Figure, text: str, *, size: float = 15.0) -> None:
     figure.text(0.15 / width, 1 - 0.32 / height, text, fontsize=size, weight="bold", color=INK, va="center")
 
 
+def fit_text(figure: Figure, text: str, width: float, font: FontProperties, *, end: str = "") -> str:
+    """Text and its ``end``, which is kept, shortened so that they are no wider than ``width`` [in]."""
+    if _fits(figure, text + end, width, font):
+        return text + end
+    cuts = range(len(text))
+    most = bisect_left(cuts, True, key=lambda k: not _fits(figure, f"{text[:k]}…{end}", width, font))
+    return f"{text[: max(most - 1, 0)].rstrip()}…{end}"
+
+
+def fit_names(figure: Figure, start: str, names: Sequence[str], width: float, font: FontProperties) -> str:
+    """A line's ``start`` and as many names as ``width`` [in] holds; how many more there are."""
+    shown = [label_text(name) for name in names[:_MOST_NAMES]]
+    for count in range(len(shown), 0, -1):
+        rest = len(names) - count
+        end = f" and {rest} more" if rest else ""
+        text = start + ", ".join(shown[:count])
+        if count == 1 or _fits(figure, text + end, width, font):
+            return fit_text(figure, text, width, font, end=end)
+    return start
+
+
+def _fits(figure: Figure, text: str, width: float, font: FontProperties) -> bool:
+    """Whether a line of text is no wider than so many inches."""
+    renderer = cast(Any, figure.canvas).get_renderer()  # matplotlib does not say its types
+    with _quiet_glyphs():
+        across, _, _ = renderer.get_text_width_height_descent(text, font, ismath=False)
+    return bool(across <= width * figure.dpi)
+
+
 def set_heading(axes: Axes, text: str) -> None:
     """Say above a panel what it shows."""
     axes.set_title(label_text(text), loc="left", fontsize=HEADING_PT, color=INK, pad=8)
@@ -95,9 +129,16 @@ def hide_frame(axes: Axes) -> None:
 @plain_style()
 def save_png(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, the same bytes for the same figure. ``path`` is either absent, as before, or whole."""
-    with output_file(path) as temporary, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # names in other scripts show as boxes, and that is all
+    with output_file(path) as temporary, _quiet_glyphs():
         figure.savefig(temporary, format="png", facecolor="white", metadata={"Software": None})
+
+
+@contextmanager
+def _quiet_glyphs() -> Iterator[None]:
+    """Names in other scripts show as boxes, and that is all."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")
+        yield
 
 
 def _further_colors() -> Iterator[str]:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from matplotlib.image import imread
 from flowlab.cli.grade import grade
 from flowlab.errors import DataError, FlowlabError, MissingLibraryError, UsageError
 from flowlab.geometry.camera import Camera
+from flowlab.grading.origin import Origin
+from flowlab.grading.run import grade as grade_in_python
 from flowlab.recordings.writing import write_rgbd_recording
 
 STEPS, WIDTH, HEIGHT = 12, 96, 72
@@ -63,10 +66,26 @@ def test_recordings_below_a_folder_are_graded(slides: Path, tmp_path: Path, caps
     assert tracker["mean"]["tapvid"]["apd"] > 0.9
     assert "moving" not in tracker["mean"], "nobody said what the points lie on"
     assert values["simulated"] is None
+    assert [(r["scene"], r["seed"], r["sensor"], r["size"]) for r in tracker["recordings"]] == [
+        ("", None, "", [WIDTH, HEIGHT])
+    ] * 2
     assert imread(tmp_path / "grade.png").shape[0] > 300
     for word in ("lucas-kanade", "visible", "two", "one", "3D-AJ", "grade.png"):
         assert word in printed.out
     assert max(map(len, printed.out.splitlines()[:-1])) <= 80
+
+
+def test_a_report_says_what_was_graded_and_with_what(slides: Path, tmp_path: Path) -> None:
+    report = grade_in_python([slides], tmp_path, trackers=["lucas-kanade"])
+    assert report.graded == ("two", "one")
+    own = "sensor of own recordings not stated"
+    assert report.about == ("2 recordings", f"{2 * STEPS} frames, 40 query points", own, "96 × 72 px")
+    (tracker,) = report.trackers
+    film = replace(tracker.rows[0], origin=Origin("thin", 1000, "tof"))
+    mixed = replace(report, trackers=(replace(tracker, rows=(film, tracker.rows[1])),))
+    assert mixed.graded == ("thin", "one")
+    assert mixed.about[0] == "2 recordings (seed 1000)"
+    assert mixed.about[2:4] == ("simulated sensor: tof", own)
 
 
 def test_json_is_all_that_is_printed(slides: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,6 +137,9 @@ def test_scenes_are_filmed_and_told_by_family(tmp_path: Path, capsys: pytest.Cap
     assert set(tracker["scenes"]) == {"thin", "plain"}
     assert 0 <= tracker["scenes"]["thin"]["confidently_wrong"] <= 1
     assert {row["scene"] for row in tracker["recordings"]} == {"thin", "plain"}
+    assert {(row["seed"], row["sensor"], *row["size"]) for row in tracker["recordings"]} == {
+        (7, "drawn by the seed", 96, 72)
+    }
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The picture of grades shows the figures that it is given."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def make_metrics(error_m: float, *, roles: bool = True, sigma: bool = True) -> T
 
 def test_a_panel_for_each_group_and_a_line_for_each_tracker() -> None:
     metrics = {"good": make_metrics(0.002), "poor": make_metrics(0.02, sigma=False)}
-    figure = plot_grades(metrics, "two trackers", "made by hand")
+    figure = plot_grades(metrics, ["hammer", "push"], ["2 recordings", "simulated sensor: kinect"])
     *panels, reliability = figure.axes
     assert [p.get_title(loc="left") for p in panels] == list(GROUPS.values())
     for panel, group in zip(panels, GROUPS, strict=True):
@@ -45,22 +46,53 @@ def test_a_panel_for_each_group_and_a_line_for_each_tracker() -> None:
     assert calibration is not None
     drawn = np.array(calibration.count) >= RELIABILITY_POINTS
     np.testing.assert_array_equal(reliability.lines[1].get_ydata(), np.array(calibration.true_mm)[drawn])
-    (legend,) = figure.legends
-    assert [t.get_text() for t in legend.get_texts()] == ["good", "poor"]
     words = {t.get_text() for t in figure.texts}
-    assert {"two trackers", "made by hand"} <= words
+    assert words == {
+        "error of tracks: hammer, push",
+        "2 recordings   ·   simulated sensor: kinect",
+        "good: 0.00% confidently wrong",
+        "poor: states no errors",
+        "confidently wrong: in sight, true error above 20 mm and above 4 σ",
+    }
+    assert [line.get_color() for line in figure.artists] == [line.get_color() for line in panels[0].lines]
+
+
+@pytest.mark.parametrize(
+    ("graded", "about"),
+    [
+        ([f"task-with-a-long-name-{k}" for k in range(100)], ["100 recordings"]),
+        (["W" * 300, "x"], ["fact " * 100, "another"]),
+        (["W" * 300], []),
+        (["i" * 60] * 100, ["漢" * 500]),
+    ],
+)
+def test_nothing_leaves_the_picture_however_much_there_is(graded: list[str], about: list[str]) -> None:
+    one = make_metrics(0.01, roles=False)
+    figure = plot_grades({"good": one, "W" * 300: one, **{f"tracker {k}": one for k in range(12)}}, graded, about)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")
+        figure.canvas.draw()
+        boxes = [text.get_window_extent() for text in figure.texts if text.get_text()]
+    assert max(box.x1 for box in boxes) <= figure.bbox.x1
+    assert min(box.x0 for box in boxes) >= 0
+    assert min(box.y0 for box in boxes) >= 0
+    assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+    lowest = min(panel.get_tightbbox().y0 for panel in figure.axes)
+    assert sum(box.y1 < lowest for box in boxes) == len(boxes) - 2 + (not about), "all but the title are below panels"
+    (title,) = [t.get_text() for t in figure.texts if t.get_text().startswith("error of tracks")]
+    assert title.endswith(" more") == (len(graded) > 1)
 
 
 def test_absent_groups_have_no_panel() -> None:
-    figure = plot_grades({"only": make_metrics(0.01, roles=False, sigma=False)}, "camera moves")
+    figure = plot_grades({"only": make_metrics(0.01, roles=False, sigma=False)}, ["camera moves"])
     assert [a.get_title(loc="left") for a in figure.axes] == [GROUPS["all"]]
     nothing = replace(make_metrics(0.01, roles=False, sigma=False), all=None)
-    assert len(plot_grades({"nothing": nothing}, "a single frame").axes) == 1
+    assert len(plot_grades({"nothing": nothing}, ["a single frame"]).axes) == 1
 
 
 def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "deeper" / "grade.png"
-    draw_grades({"only": make_metrics(0.01)}, path, title="written")
+    draw_grades({"only": make_metrics(0.01)}, path, graded=["written"])
     picture = imread(path)
     assert picture.shape[1] > 2 * picture.shape[0]
     assert picture[..., :3].min() < 0.5
@@ -71,6 +103,6 @@ def test_the_file_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("os.replace", fails)
     with pytest.raises(DataError, match="no space"):
-        draw_grades({"only": make_metrics(0.02)}, path, title="lost")
+        draw_grades({"only": make_metrics(0.02)}, path, graded=["lost"])
     assert path.read_bytes() == before
     assert [f.name for f in path.parent.iterdir()] == ["grade.png"]
