@@ -72,7 +72,7 @@ def grade(
     A RECORDING is a folder with a ground_truth.npz, or holds such folders. With --tasks, MetaWorld's experts
     are recorded by a simulated depth camera, with --scenes, things that move on a table are filmed; the recordings
     are kept in OUT/recordings, and used again by the next run with the same settings. OUT/grade.json and
-    OUT/grade.png are written.
+    OUT/grade.png are written; the picture says what was graded, with which sensor, and by which trackers.
     """
     from flowlab.grading.run import REPORT
     from flowlab.grading.run import grade as run_grading

@@ -42,8 +42,11 @@ def viz(
       flowlab viz runs/push-fdp --task push --seed 3
 
     SOURCE is a dataset, or a RUN of `flowlab train` (or one of its checkpoints), which tries the episode that
-    `flowlab eval` gives this number. Tracks that were estimated are colored by their stated error, exact ones by what
-    they lie on. With none of --save, --png and --mp4, a recording is written beside you.
+    `flowlab eval` gives this number. With none of --save, --png and --mp4, a recording is written beside you.
+
+    Tracks that were estimated are colored by their stated error σ: turquoise below 5 mm, yellow below 10, orange below
+    20, red below 50, purple from there on. From 20 mm on, trails are faint, and a circle of radius σ is drawn around
+    the point. A disc is in sight, a ring hidden, a cross filled in. Exact tracks are colored by what they lie on.
     """
     from flowlab.errors import UsageError
     from flowlab.report.episode_view import view_episode

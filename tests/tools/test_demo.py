@@ -7,8 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+from synthetic import make_filmed_episode, make_manifest, put_unit
+
+from flowlab.storage.dataset import begin
 
 DEMO = Path(__file__).parents[2] / "tools" / "demo"
 
@@ -57,6 +61,55 @@ def test_a_policy_that_solves_less_than_half_is_a_failure(
     assert (sentence in (tmp_path / "index.html").read_text()) == bool(code)
 
 
+@pytest.mark.parametrize(
+    ("within", "sentence"),
+    [
+        ({"rigid-bodies": 0.7, "lucas-kanade": 0.69}, ""),
+        ({"rigid-bodies": 0.7, "lucas-kanade": 0.71}, "70% by rigid-bodies, 71% by lucas-kanade"),
+        ({"rigid-bodies": 0.59, "lucas-kanade": 0.4}, "59% by rigid-bodies, 40% by lucas-kanade"),
+    ],
+)
+def test_labels_that_are_not_worth_a_look_are_a_failure(
+    demo: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str], within: dict[str, float], sentence: str
+) -> None:
+    errors = {"median_mm": 3.0, "p95_mm": 9.0}
+    means = {
+        name: {
+            **{group: {**errors, "within_20mm": share} for group in ("all", "moving", "object", "occluded")},
+            "calibration": {"within_1_sigma": 0.66},
+            "confidently_wrong": 0.0123,
+        }
+        for name, share in within.items()
+    }
+    row = {"seed": 0, "frames": 62, "queries": 96}
+    trackers = [{"tracker": name, "mean": mean, "recordings": [row]} for name, mean in means.items()]
+
+    def graded(commands: Any) -> None:
+        (commands.folder / "graded").mkdir()
+        (commands.folder / "graded" / "grade.json").write_text(json.dumps({"trackers": trackers}))
+
+    assert demo.main(tmp_path, graded) == bool(sentence)
+    page = (tmp_path / "index.html").read_text()
+    assert ("of the object's positions are within 20 mm: " + sentence in capsys.readouterr().err) == bool(sentence)
+    assert (sentence in page) or not sentence
+    assert "1.23 % are confidently wrong" in page
+
+
+def test_the_page_says_which_share_is_stated_below_what(demo: ModuleType, tmp_path: Path) -> None:
+    folder = tmp_path / "real"
+    manifest = begin(folder, make_manifest({"pour": 1}))
+    put_unit(folder, [make_filmed_episode()], manifest.settings_digest)
+    page = " ".join(demo.write_page(tmp_path, [], [], 60.0).read_text().split())
+    shares = re.findall(r"</i>(\S+ \d+ mm): <b>(\d+) %", page)
+    assert shares == [
+        ("&lt; 5 mm", "20"),
+        ("&lt; 10 mm", "20"),
+        ("&lt; 20 mm", "20"),
+        ("&lt; 50 mm", "80"),
+        ("≥ 50 mm", "20"),
+    ]
+
+
 def test_a_command_that_fails_is_told_where_it_belongs_and_the_rest_goes_on(
     demo: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,3 +152,5 @@ def test_the_whole_demo_succeeds_and_its_page_shows_what_was_measured(tmp_path: 
     for group in ("moving", "object"):
         assert f"{rigid[group]['median_mm']:.1f} mm" in page
         assert rigid[group]["median_mm"] < classic[group]["median_mm"]
+    assert rigid["object"]["within_20mm"] >= 0.6
+    assert f"{100 * rigid['confidently_wrong']:.2f} % are confidently wrong" in page

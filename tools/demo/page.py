@@ -9,6 +9,9 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
+from flowlab import open_dataset
+from flowlab.viz.stated_error import SIGMA_NAMES, SIGMA_RGB, shares_below, stated_sigma
+
 MINUTES = 1
 """Of CPU time that the policy trains for."""
 _HERE = Path(__file__).parent
@@ -59,12 +62,19 @@ def first_solved(folder: Path) -> int | None:
     return next((o["episode"] for o in outcomes(folder) if o["success"]), None)
 
 
+def object_within(folder: Path) -> dict[str, float]:
+    """Of the object's positions in sight, the share of each tracker within 20 mm; empty where nothing was graded."""
+    graded = _read(folder / "graded" / "grade.json") or {"trackers": []}
+    return {t["tracker"]: t["mean"]["object"]["within_20mm"] for t in graded["trackers"] if "object" in t["mean"]}
+
+
 def facts(folder: Path) -> dict[str, Any]:
     """What the page says, from the files in the folder; a part whose files are not there is None."""
     return {
         "data": _read(folder / "data.json"),
         "train": _training(folder / "run"),
         "eval": _evaluation(folder),
+        "labels": _labels(folder / "real"),
         "grade": _grade(folder / "graded" / "grade.json"),
     }
 
@@ -92,6 +102,16 @@ def _evaluation(folder: Path) -> dict[str, Any] | None:
         "shown": next((o for o in outcomes(folder) if o["success"]), None),
         "flow": next((f["error"] for f in summary["flow"] if f["over"] == "all"), None),
     }
+
+
+def _labels(real: Path) -> list[dict[str, Any]] | None:
+    """The classes of stated errors: name, color, and the share of the labeled positions below its end."""
+    if not (real / "flowlab.json").exists():
+        return None
+    sigma = stated_sigma(open_dataset(real).episode(0))
+    assert sigma is not None
+    named = zip(SIGMA_NAMES, SIGMA_RGB, shares_below(sigma), strict=True)
+    return [{"name": name, "color": "#{:02x}{:02x}{:02x}".format(*rgb), "share": share} for name, rgb, share in named]
 
 
 def _grade(path: Path) -> dict[str, Any] | None:
