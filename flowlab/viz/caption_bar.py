@@ -16,7 +16,7 @@ from flowlab.text import cut
 from flowlab.viz.captions import role_name, tracker_name
 from flowlab.viz.colors import PREDICTED_RGB, role_rgb
 from flowlab.viz.plot_style import label_text, plain_style
-from flowlab.viz.stated_error import COARSE_M, SIGMA_NAMES, SIGMA_RGB, class_shares, shares_below, stated_sigma
+from flowlab.viz.stated_error import COARSE_M, SIGMA_NAMES, SIGMA_RGB, class_shares, percent, shares_below, stated_sigma
 
 _DPI = 128
 """A power of two, so that sizes in inches are whole pixels."""
@@ -71,7 +71,7 @@ class CaptionBar:
         self._state.set_text(f"{episode.tracks.visible[t, :count].sum()} of {count} points in sight")
         if self._sigma is not None:
             for text, share in zip(self._shares, shares_below(self._sigma[t]), strict=True):
-                text.set_text(f"{share:.0%}")
+                text.set_text(percent(share))
         for text in (self._step, self._state, *self._shares):
             self._figure.draw_artist(text)
         picture = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
@@ -114,7 +114,7 @@ class CaptionBar:
         y, shares = _LEGEND_Y + _ERROR_HEIGHT, []
         self._write(14, y, "stated error σ", size=11, color=_QUIET)
         for k, (name, rgb) in enumerate(zip(SIGMA_NAMES, SIGMA_RGB, strict=True)):
-            x = 112 + 106 * k
+            x = 108 + 107 * k
             self._dot(x, "s", tuple(np.array(rgb) / 255), "none", y=y, size=10)
             self._write(x + 9, y, name, size=11, color=_QUIET)
             shares.append(self._write(x + 66, y, "", size=11))

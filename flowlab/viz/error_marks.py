@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from flowlab.viz.panels import BAR, dot
 from flowlab.viz.plot_style import LABEL_PT, QUIET, TICK_PT, hide_frame
-from flowlab.viz.stated_error import SIGMA_NAMES, SIGMA_RGB, class_shares, is_coarse, shares_below, sigma_rgb
+from flowlab.viz.stated_error import SIGMA_NAMES, SIGMA_RGB, class_shares, is_coarse, percent, shares_below, sigma_rgb
 
 _FAINT = 0.3
 _DARKER = 0.88
@@ -48,7 +48,7 @@ def draw_error_circles(
 def error_legend(sigma: Float[np.ndarray, "T M"]) -> list[Line2D]:
     """A legend's entries of the classes of stated errors, with the share of positions below the end of each."""
     named = zip(SIGMA_NAMES, shares_below(sigma), _ON_WHITE, strict=True)
-    dots = [dot(f"{name}: {share:.0%}", tuple(color), "none") for name, share, color in named]
+    dots = [dot(f"{name}: {percent(share)}", tuple(color), "none") for name, share, color in named]
     dots[0].set_label(f"σ {dots[0].get_label()}")
     return dots
 

@@ -49,7 +49,14 @@ def shares_below(sigma: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "5"]:
     return np.append(np.cumsum(shares[:-1]), shares[-1])
 
 
+def percent(share: float) -> str:
+    """A share in percent, which is 0 or 100 only where it is none or all."""
+    if 0 < share < 0.005:
+        return "<1%"
+    return ">99%" if 0.995 <= share < 1 else f"{share:.0%}"
+
+
 def describe_shares(sigma: Float[np.ndarray, "*batch"]) -> str:
     """Which share of stated errors is below the end of each class, in words."""
     *below, _ = shares_below(sigma)
-    return "σ " + ", ".join(f"{name} {share:.0%}" for name, share in zip(SIGMA_NAMES, below, strict=False))
+    return "σ " + ", ".join(f"{name} {percent(share)}" for name, share in zip(SIGMA_NAMES, below, strict=False))

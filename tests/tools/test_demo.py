@@ -100,7 +100,7 @@ def test_the_page_says_which_share_is_stated_below_what(demo: ModuleType, tmp_pa
     manifest = begin(folder, make_manifest({"pour": 1}))
     put_unit(folder, [make_filmed_episode()], manifest.settings_digest)
     page = " ".join(demo.write_page(tmp_path, [], [], 60.0).read_text().split())
-    shares = re.findall(r"</i>(\S+ \d+ mm): <b>(\d+) %", page)
+    shares = re.findall(r"</i>(\S+ \d+ mm): <b>(\d+)%<", page)
     assert shares == [
         ("&lt; 5 mm", "20"),
         ("&lt; 10 mm", "20"),

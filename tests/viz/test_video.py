@@ -14,7 +14,7 @@ from flowlab.records import Episode, Role
 from flowlab.viz.caption_bar import CaptionBar
 from flowlab.viz.colors import ROLE_RGB
 from flowlab.viz.overlay import Overlay
-from flowlab.viz.stated_error import SIGMA_RGB, describe_shares, is_coarse, shares_below, sigma_rgb
+from flowlab.viz.stated_error import SIGMA_RGB, describe_shares, is_coarse, percent, shares_below, sigma_rgb
 from flowlab.viz.video import write_video
 
 SCALE = 8  # 80 pixels wide becomes 640
@@ -152,6 +152,9 @@ def test_stated_errors_have_the_same_classes_everywhere() -> None:
     np.testing.assert_array_equal(sigma_rgb(sigma), np.array(SIGMA_RGB)[expected])
     np.testing.assert_array_equal(is_coarse(sigma), np.array(expected) >= 3)
     np.testing.assert_allclose(shares_below(sigma), [0.2, 0.3, 0.4, 0.6, 0.4])
+    assert [percent(share) for share in (0, 1e-3, 0.006, 0.5, 0.994, 0.999, 1)] == [
+        "0%", "<1%", "1%", "50%", "99%", ">99%", "100%",
+    ]  # fmt: skip
     assert describe_shares(sigma) == "σ < 5 mm 20%, < 10 mm 30%, < 20 mm 40%, < 50 mm 60%"
 
 
@@ -284,7 +287,7 @@ def test_the_strip_says_whose_film_it_is_and_how_far(episode: Episode, film: np.
         assert np.abs(shares[y, 100] - expected).max() < 40
         assert shares[y, 500].max() < 0.5 * shares[y, 100].max()
     for k, expected in enumerate(SIGMA_RGB):
-        assert shows(film[0], 582, 112 + 106 * k, expected, 40)
+        assert shows(film[0], 582, 108 + 107 * k, expected, 40)
 
 
 def test_the_strip_of_exact_tracks_says_so(episode: Episode) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from flowlab import open_dataset
-from flowlab.viz.stated_error import SIGMA_NAMES, SIGMA_RGB, shares_below, stated_sigma
+from flowlab.viz.stated_error import SIGMA_NAMES, SIGMA_RGB, percent, shares_below, stated_sigma
 
 MINUTES = 1
 """Of CPU time that the policy trains for."""
@@ -110,8 +110,11 @@ def _labels(real: Path) -> list[dict[str, Any]] | None:
         return None
     sigma = stated_sigma(open_dataset(real).episode(0))
     assert sigma is not None
-    named = zip(SIGMA_NAMES, SIGMA_RGB, shares_below(sigma), strict=True)
-    return [{"name": name, "color": "#{:02x}{:02x}{:02x}".format(*rgb), "share": share} for name, rgb, share in named]
+    named = zip(SIGMA_NAMES, SIGMA_RGB, percent, shares_below(sigma), strict=True)
+    return [
+        {"name": name, "color": "#{:02x}{:02x}{:02x}".format(*rgb), "share": percent(share)}
+        for name, rgb, share in named
+    ]
 
 
 def _grade(path: Path) -> dict[str, Any] | None:
