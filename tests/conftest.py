@@ -14,6 +14,8 @@ import pytest
 from hypothesis import settings
 from thoroughness import examples
 
+from flowlab.engines.local import LocalEngine
+from flowlab.files import locked
 from flowlab.pipeline.recipe import load_recipe
 from flowlab.pipeline.stage import EpisodeRequest
 from flowlab.records import Episode
@@ -43,6 +45,9 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Decoded datasets of tests lie in a cache of their own, in other processes too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FLOWLAB_CACHE", str(tmp_path_factory.mktemp("cache")))
+        # Workers of all commands that run in this process are forked from one that has imported what any of them needs.
+        with LocalEngine(len, workers=1, imports=["flowlab.pipeline.worker", "flowlab.benchmark.experiment"]):
+            pass
         yield
 
 
@@ -69,8 +74,14 @@ def hammer_episode() -> Episode:
 
 @pytest.fixture(scope="session")
 def small_dataset(tmp_path_factory: pytest.TempPathFactory, flowlab: Cli) -> Path:
-    """Two tasks, three episodes each, made through the command line. Copy it before changing it."""
-    folder = tmp_path_factory.mktemp("data") / "small"
-    result = flowlab("extract-sim", "drawer-open", "push-back", "--episodes", 3, "--out", folder, "--workers", 2)
-    assert result.returncode == 0, result.stderr
+    """Two tasks, three episodes each, made through the command line, once for all test processes. Copy it before
+    changing it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "small"
+    with locked(folder.parent):
+        if not folder.exists():
+            made = tmp_path_factory.mktemp("data") / "small"
+            result = flowlab("extract-sim", "drawer-open", "push-back", "--episodes", 3, "--out", made, "--workers", 2)
+            assert result.returncode == 0, result.stderr
+            made.rename(folder)
     return folder

@@ -28,7 +28,9 @@ class Diffusion(nn.Module):
             return math.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
 
         beta = [min(1 - level((i + 1) / train_steps) / level(i / train_steps), 0.999) for i in range(train_steps)]
-        alphas_cumprod = torch.cumprod(1 - torch.tensor(beta, dtype=torch.float32), 0)
+        # On the CPU also where a network is only sketched: there, arithmetic would load half of torch's compiler first.
+        with torch.device("cpu"):
+            alphas_cumprod = torch.cumprod(1 - torch.tensor(beta, dtype=torch.float32), 0)
         self.register_buffer("alphas_cumprod", alphas_cumprod, persistent=False)
         self.train_steps = train_steps
         stride = train_steps // inference_steps

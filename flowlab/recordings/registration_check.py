@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from jaxtyping import Float32
+from scipy import fft
 
 from flowlab.recordings.image_files import exif_turns
 from flowlab.recordings.lens import undistorted_rays
@@ -75,7 +76,7 @@ def estimate_misalignment(samples: Sequence[PictureSample]) -> Misalignment | No
         return None
     width = pairs[0][0].shape[2]
     reach = max(2, round(_SHIFT * width))
-    scores = np.stack([_scores(pairs, scale, reach) for scale in _SCALES])
+    scores = _scores(pairs, reach)
     at = np.unravel_index(scores.argmax(), scores.shape)
     spread, mean = float(scores.std()), float(scores.mean())
     k, dy, dx = int(at[0]), int(at[1]) - reach, int(at[2]) - reach
@@ -135,22 +136,20 @@ def _clear_share(gray: np.ndarray) -> float:
     return float((np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) > _CLEAR).mean())
 
 
-def _scores(pairs: Sequence[tuple[np.ndarray, np.ndarray]], scale: float, reach: int) -> np.ndarray:
-    """Mean strength of color edges under depth edges, for every shift (dy, dx) within reach."""
-    total = np.zeros((2 * reach + 1, 2 * reach + 1))
+def _scores(pairs: Sequence[tuple[np.ndarray, np.ndarray]], reach: int) -> np.ndarray:
+    """Mean strength of color edges under depth edges, at every scale, and for every shift (dy, dx) within reach."""
+    rows = np.r_[-reach : reach + 1]
+    total = np.zeros((len(_SCALES), len(rows), len(rows)))
     for depth, color in pairs:
         height, width = depth.shape[1:]
         size = (cv2.getOptimalDFTSize(height + reach), cv2.getOptimalDFTSize(width + reach))
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
-        place = np.column_stack([scale * np.eye(2), middle * (1 - scale)])
-        spectrum, weight = np.zeros((size[0], size[1] // 2 + 1), np.complex128), 0.0
-        for axis in (0, 1):
-            moved = cv2.warpAffine(depth[axis], place, (width, height), flags=cv2.INTER_LINEAR)
-            spectrum += np.conj(np.fft.rfft2(moved, size)) * np.fft.rfft2(color[axis], size)
-            weight += float(moved.sum())
-        near = np.fft.irfft2(spectrum, size)
-        rows = np.r_[-reach : reach + 1]
-        total += near[np.ix_(rows, rows)] / max(weight, 1.0)
+        spectrum = fft.rfft2(color, size)
+        for k, scale in enumerate(_SCALES):
+            place = np.column_stack([scale * np.eye(2), middle * (1 - scale)])
+            moved = np.stack([cv2.warpAffine(d, place, (width, height), flags=cv2.INTER_LINEAR) for d in depth])
+            near = fft.irfft2((np.conj(fft.rfft2(moved, size)) * spectrum).sum(0), size)
+            total[k] += near[np.ix_(rows, rows)] / max(float(moved.sum()), 1.0)
     return total / len(pairs)
 
 
