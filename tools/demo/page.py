@@ -110,7 +110,7 @@ def _labels(real: Path) -> list[dict[str, Any]] | None:
         return None
     sigma = stated_sigma(open_dataset(real).episode(0))
     assert sigma is not None
-    named = zip(SIGMA_NAMES, SIGMA_RGB, percent, shares_below(sigma), strict=True)
+    named = zip(SIGMA_NAMES, SIGMA_RGB, shares_below(sigma), strict=True)
     return [
         {"name": name, "color": "#{:02x}{:02x}{:02x}".format(*rgb), "share": percent(share)}
         for name, rgb, share in named
