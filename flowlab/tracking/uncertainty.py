@@ -6,21 +6,27 @@ from jaxtyping import Float32, Float64
 from flowlab.records import Clip, PositionSource, Tracks2D
 from flowlab.tracking.lifting import Lifted
 
-EVIDENCE = ("1", "depth", "moved", "disagreement", "forward-backward", "doubt", "hidden", "no depth", "hidden for")
+EVIDENCE = (
+    "1", "depth", "moved", "disagreement", "forward-backward", "misfit", "hidden", "no depth", "hidden for", "doubt",
+)  # fmt: skip
 """What the error is told from, see :func:`evidence`."""
 
 WEIGHTS = {
-    PositionSource.MEASURED: (-7.084, 2.000, 0.905, 0.025, 0.000, 0.460, 0.000, 0.000, 0.000),
-    PositionSource.MODEL: (-6.958, 2.000, 0.230, 0.258, 0.000, 1.786, 0.150, 0.948, 0.160),
-    PositionSource.FILLED: (-5.659, 2.000, 0.446, 0.060, 0.094, 0.742, 0.000, 0.000, 0.402),
+    PositionSource.MEASURED: (-7.084, 2.000, 0.905, 0.025, 0.000, 0.460, 0.000, 0.000, 0.000, 0.000),
+    PositionSource.MODEL: (-7.517, 2.000, 0.112, 0.000, 0.000, 2.691, 0.000, 0.591, 0.179, 0.127),
+    PositionSource.FILLED: (-5.659, 2.000, 0.446, 0.060, 0.094, 0.742, 0.000, 0.000, 0.402, 0.000),
 }
 """Log of the error [m] per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py`` as of commit 79936e4, on tasks
 alone."""
+FAR_OFF = ((-3.5, -3.0, -2.0, 0.0), (0.0, 0.03, 0.10, 0.40))
+"""Log-odds of being far off, and the least error [m] that is stated then: so much that more than four times it is rare.
+Chosen with those weights."""
 _LEAST_M, _MOST_M = 0.0005, 1.0
 
 
 def stated_error(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float32[np.ndarray, "T M"]:
-    """The error [m] that 68 % of such positions stay below, by a regression calibrated on simulation.
+    """The error [m] that two in three of such positions stay below, by a regression calibrated on simulation; more,
+    where the tracker finds it likely that the position is far off (:attr:`Tracks2D.doubt`).
 
     The point at the first frame is the query itself: its error is the sensor's, at most what any other row states.
     """
@@ -29,13 +35,29 @@ def stated_error(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float32[np.nda
     for source, weights in WEIGHTS.items():
         mine = lifted.source == source
         log_error[mine] = values[mine] @ weights
-    return np.exp(log_error).clip(_LEAST_M, _MOST_M).astype(np.float32)
+    error = np.exp(log_error)
+    if tracks.doubt is not None:
+        modeled = lifted.source == PositionSource.MODEL
+        error[modeled] = np.maximum(error[modeled], least_error(tracks.doubt[modeled]))
+    return error.clip(_LEAST_M, _MOST_M).astype(np.float32)
+
+
+def least_error(doubt: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """The error [m] that is stated at least for positions that are so likely to be far off; 0 where that is untold."""
+    return np.where(doubt < 0, 0, np.interp(log_odds(doubt), *FAR_OFF))
+
+
+def log_odds(probability: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """Of probabilities, within 1 to 1,000 and its inverse."""
+    p = probability.astype(np.float64).clip(1e-3, 1 - 1e-3)
+    return np.log(p / (1 - p))
 
 
 def evidence(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float64[np.ndarray, "T M E"]:
     """What tells the error of every position: logs of how deep it is, how far it has moved, how far apart other
-    estimates put it, and how far it lands when followed back; doubt of the tracker in it (0 to 1); whether it is
-    hidden, or without depth; and the log of for how many frames it has been hidden."""
+    estimates put it, and how far it lands when followed back; how badly it fits the pictures (0 to 1); whether it
+    is hidden, or without depth; the log of for how many frames it has been hidden; and the log-odds of being far off,
+    from 0 for what is not doubted at all."""
     xyz_cam = clip.to_camera(lifted.xyz_world)
     z = np.maximum(xyz_cam[..., 2], 0.05)
     meters_per_px = z / clip.camera.K[0, 0]
@@ -54,6 +76,7 @@ def evidence(clip: Clip, tracks: Tracks2D, lifted: Lifted) -> Float64[np.ndarray
         ~lifted.visible,
         ~lifted.depth_valid,
         np.log1p(_frames_hidden(lifted.visible)),
+        np.zeros_like(z) if tracks.doubt is None else np.where(tracks.doubt < 0, 0, log_odds(tracks.doubt) + 7),
     )
     return np.stack([np.asarray(c, float) for c in columns], -1)
 

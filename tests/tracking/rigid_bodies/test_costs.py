@@ -131,10 +131,10 @@ def test_a_point_is_seen_where_its_depth_is_read_or_nothing_is() -> None:
     depth = np.full((1, 20, 30), 1.0, np.float32)
     depth[0, :, 15:] = 0.7
     depth[0, 10:, :] = 0
-    uv = np.array([[[5.0, 5], [5, 5], [20, 5], [15, 5], [5, 15]]])
-    z = np.array([[1.005, 1.05, 1.0, 1.0, 1.0]])
-    #             here,  behind, hidden, hidden but for its neighbor, a hole
-    np.testing.assert_array_equal(_surfaces.is_seen(depth, uv, z), [[True, False, False, True, True]])
+    uv = np.array([[[5.0, 5], [5, 5], [20, 5], [15, 5], [14, 5], [5, 15], [-1, 5]]])
+    z = np.array([[1.005, 1.05, 1.0, 1.0, 1.0, 1.0, 1.0]])
+    #             here,  behind, hidden, hidden at the border of what covers it, beside that, a hole, out of the picture
+    np.testing.assert_array_equal(_surfaces.is_seen(depth, uv, z), [[True, False, False, False, True, True, False]])
 
 
 def test_how_far_beyond_points_the_surface_is_read() -> None:

@@ -9,6 +9,9 @@ import numpy as np
 
 from flowlab.tracking.trackers.rigid_bodies._costs import A, B, L, tolerance
 
+_MOST_OF_9 = 6
+"""Of the 3x3 readings around a pixel."""
+
 
 @numba.njit(cache=True)
 def smooth_depth(depth) -> np.ndarray:
@@ -95,19 +98,29 @@ def aggregate(cost, wanted, valid, depth, feature, reach, depth_scale, color_sca
 
 @numba.njit(cache=True)
 def is_seen(depth, uv, z) -> np.ndarray:
-    """Whether depth pictures (T, H, W) have a reading like z (T, M) [m] around pixels (T, M, 2), or none at all."""
+    """Whether depth pictures (T, H, W) show points at pixels (T, M, 2) and depths (T, M) [m].
+
+    They do where a reading around is as deep, or where there is none at all, unless the reading at the very pixel and
+    most around it are nearer: at the border of what covers a point, a reading of its own surface is no sight of it.
+    """
     height, width = depth.shape[1:]
     out = np.zeros(z.shape, np.bool_)
     for t in range(z.shape[0]):
         for k in range(z.shape[1]):
             i, j = int(np.rint(uv[t, k, 1])), int(np.rint(uv[t, k, 0]))
-            empty = True
+            if not (z[t, k] > 0.05 and i >= 0 and j >= 0 and i < height and j < width):
+                continue
+            within = 2 * tolerance(z[t, k])
+            read, like, nearer = 0, 0, 0
             for y in range(max(i - 1, 0), min(i + 2, height)):
                 for x in range(max(j - 1, 0), min(j + 2, width)):
                     if depth[t, y, x] > 0:
-                        empty = False
-                        out[t, k] |= abs(depth[t, y, x] - z[t, k]) < 2 * tolerance(z[t, k])
-            out[t, k] |= empty
+                        off = depth[t, y, x] - z[t, k]
+                        read += 1
+                        like += abs(off) < within
+                        nearer += off <= -within
+            covered = nearer >= _MOST_OF_9 and 0 < depth[t, i, j] <= z[t, k] - within
+            out[t, k] = read == 0 or (like > 0 and not covered)
     return out
 
 

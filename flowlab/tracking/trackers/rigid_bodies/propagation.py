@@ -54,7 +54,8 @@ def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarr
     every = np.stack([m.apply(xyz) for m in fit.motions])
     path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
     path = _refine_depth(fit, path, (motion > 0) | fit.pictures.still_is_fitted)
-    seen, least = _visible(fit, path), cost.min(0)
+    seen = _surfaces.is_seen(fit.pictures.depth, fit.pictures.project(path), path[..., 2])
+    least = cost.min(0)
     belief = np.exp(-(cost - least) / _COST_SCALE)
     belief /= belief.sum(0)
     spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
@@ -121,11 +122,3 @@ def _smooth_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndar
             total = total + w * fit.assignment.raw[:, a, b]
             weights = weights + w
     return (total / weights).astype(np.float32)
-
-
-def _visible(fit: RigidBodyFit, path: np.ndarray) -> np.ndarray:
-    """Whether the depth pictures show the points (T, M, 3) where they are."""
-    uv = fit.pictures.project(path)
-    height, width = fit.pictures.depth.shape[1:]
-    inside = ((uv > -0.5) & (uv < [width - 0.5, height - 0.5])).all(-1) & (path[..., 2] > 0)
-    return inside & _surfaces.is_seen(fit.pictures.depth, uv, path[..., 2])

@@ -1,19 +1,23 @@
 """The ``rigid-bodies`` tracker: queries carried by the motions of a fit."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64, Int64
 from pydantic import Field
 
 from flowlab.records import Clip, Tracks2D
 from flowlab.tracking.base import Tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
+from flowlab.tracking.lifting import LiftSettings, lift
 from flowlab.tracking.trackers.lucas_kanade import LucasKanade
+from flowlab.tracking.trackers.rigid_bodies import doubt
+from flowlab.tracking.trackers.rigid_bodies._surfaces import is_seen
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
+from flowlab.tracking.uncertainty import stated_error
 
 _MIN_FRAMES = 3
 """A shorter clip shows no motion to fit."""
@@ -68,18 +72,58 @@ class RigidBodiesSession:
         whole = self._clip
         poses = None if whole.T_world_cam is None else whole.T_world_cam[first:stop]
         clip = Clip(whole.rgb[first:stop], whole.depth[first:stop], whole.camera, poses)
-        z = depth_at(clip.depth[0], xy)
-        deep = np.flatnonzero((z > 0) & (z < self._options.max_depth))
-        if len(clip) < _MIN_FRAMES or len(deep) == 0:
-            return _followed(clip, xy)
-        pictures = extract_features(clip, self._options.max_depth)
-        carried = propagate(fit_bodies(pictures, self._options.seed), pictures.from_clip_pixels(xy[deep]), z[deep])
-        explained = deep[carried.cost < self._options.unexplained]
-        tracks = _followed(clip, xy, np.setdiff1d(np.arange(len(xy)), explained))
-        _put(tracks, explained, _modeled(pictures, carried, carried.cost < self._options.unexplained))
-        # The first frame is the question, not an answer.
-        tracks.xy[0], tracks.visible[0] = xy, True
-        return tracks
+        followed = follow(clip, xy, LucasKanade(), ChunkSettings())
+        return combined(clip, followed, fit_points(clip, xy, followed, self._options), self._options.unexplained)
+
+
+@dataclass(frozen=True, slots=True)
+class FittedPoints:
+    """Points that have depth, carried by the bodies of a clip."""
+
+    pictures: ClipFeatures
+    points: Int64[np.ndarray, "M"]
+    """Which of those asked for."""
+    carried: PropagatedTracks
+    evidence: Float64[np.ndarray, "T M E"]
+    """Against their positions, see :func:`~flowlab.tracking.trackers.rigid_bodies.doubt.evidence`."""
+
+
+def fit_points(
+    clip: Clip, xy: Float[np.ndarray, "N 2"], followed: Tracks2D, options: RigidBodies
+) -> FittedPoints | None:
+    """Fit bodies to a clip, and carry points of its first frame; None where it is too short or no point has depth.
+
+    Args:
+        clip: The pictures.
+        xy: Pixels of the points.
+        followed: The same points, followed in the pictures.
+        options: The tracker's.
+    """
+    z = depth_at(clip.depth[0], xy)
+    deep = np.flatnonzero((z > 0) & (z < options.max_depth))
+    if len(clip) < _MIN_FRAMES or len(deep) == 0:
+        return None
+    pictures = extract_features(clip, options.max_depth)
+    fit, uv = fit_bodies(pictures, options.seed), pictures.from_clip_pixels(xy[deep])
+    carried = propagate(fit, uv, z[deep])
+    lifted = lift(clip, followed, LiftSettings())
+    other = doubt.SecondOpinion(
+        clip.to_camera(lifted.xyz_world[:, deep].astype(np.float64)), stated_error(clip, followed, lifted)[:, deep]
+    )
+    return FittedPoints(pictures, deep, carried, doubt.evidence(fit, carried, uv, z[deep], other))
+
+
+def combined(clip: Clip, followed: Tracks2D, fitted: FittedPoints | None, unexplained: float) -> Tracks2D:
+    """Tracks of points as bodies carry them where that costs less than ``unexplained``, else as they were followed."""
+    xy = followed.xy[0].copy()
+    tracks = _blank(len(clip), xy)
+    _put(tracks, np.arange(len(xy)), followed)
+    if fitted is not None:
+        explained = fitted.carried.cost < unexplained
+        _put(tracks, fitted.points[explained], _modeled(clip, fitted, explained))
+    # The first frame is the question, not an answer.
+    tracks.xy[0], tracks.visible[0] = xy, True
+    return tracks
 
 
 def depth_at(depth: Float32[np.ndarray, "H W"], xy: Float[np.ndarray, "M 2"]) -> Float32[np.ndarray, "M"]:
@@ -89,21 +133,13 @@ def depth_at(depth: Float32[np.ndarray, "H W"], xy: Float[np.ndarray, "M 2"]) ->
     return np.where(inside, depth[np.where(inside, row, 0), np.where(inside, column, 0)], np.float32(0))
 
 
-def _followed(clip: Clip, xy: np.ndarray, of: np.ndarray | slice = slice(None)) -> Tracks2D:
-    """Tracks of all points, of which those of ``of`` are followed in the picture and the rest are left blank."""
-    tracks = follow(clip, xy[of], LucasKanade(), ChunkSettings())
-    whole = _blank(len(clip), xy)
-    _put(whole, np.arange(len(xy))[of], tracks)
-    return whole
-
-
 def _blank(frames: int, xy: np.ndarray) -> Tracks2D:
     """Points (M, 2) held where they are, unseen, with all that a track may have."""
     shape = (frames, len(xy))
     held = np.broadcast_to(xy.astype(np.float32), (*shape, 2)).copy()
     zero, minus = np.zeros(shape, np.float32), np.full(shape, -1, np.float32)
     nowhere = np.zeros((*shape, 3), np.float32)
-    return Tracks2D(held, np.zeros(shape, bool), zero, minus, minus.copy(), nowhere, minus.copy())
+    return Tracks2D(held, np.zeros(shape, bool), zero, minus, minus.copy(), nowhere, minus.copy(), minus.copy())
 
 
 def _put(tracks: Tracks2D, columns: np.ndarray, part: Tracks2D, rows: slice = slice(None)) -> None:
@@ -114,9 +150,10 @@ def _put(tracks: Tracks2D, columns: np.ndarray, part: Tracks2D, rows: slice = sl
             getattr(tracks, field.name)[rows, columns] = values
 
 
-def _modeled(pictures: ClipFeatures, carried: PropagatedTracks, of: np.ndarray) -> Tracks2D:
-    """Tracks of the points ``of`` as their motions carry them."""
-    xyz, seen = carried.xyz_cam[:, of], carried.visible[:, of]
+def _modeled(clip: Clip, fitted: FittedPoints, of: np.ndarray) -> Tracks2D:
+    """Tracks of the points ``of`` as their motions carry them; in sight is what the whole depth pictures show."""
+    pictures, carried = fitted.pictures, fitted.carried
+    xyz = carried.xyz_cam[:, of]
     z = xyz[..., 2]
     ahead = z > 0.05
     # A point that the motion takes behind the camera is nowhere in the picture: it is left at its border.
@@ -127,9 +164,10 @@ def _modeled(pictures: ClipFeatures, carried: PropagatedTracks, of: np.ndarray) 
     apart = np.maximum(carried.spread[:, of], carried.slip[:, of])
     return Tracks2D(
         xy.astype(np.float32),
-        seen & ahead,
+        is_seen(clip.depth, xy, z),
         (1 - cost).clip(0, 1).astype(np.float32),
         disagreement=(apart * focal / np.maximum(z, 0.05)).astype(np.float32),
         xyz_cam=np.where(ahead[..., None], xyz, 0).astype(np.float32),
         residual=carried.residual[:, of],
+        doubt=doubt.probability_far(fitted.evidence[:, of]),
     )
