@@ -80,6 +80,29 @@ def test_under_a_camera_that_moves_what_stands_still_is_no_surer() -> None:
     assert (beside[1:] > before[1:]).all()
 
 
+@given(doubt=st.floats(0, 1), more=st.floats(0, 1))
+def test_more_doubt_never_lowers_it(doubt: float, more: float) -> None:
+    clip, tracks, lifted = case()
+    low, high = (
+        stated_error(clip, replace(tracks, doubt=np.full((T, M), d, np.float32)), lifted)
+        for d in (doubt, min(doubt + more, 1))
+    )
+    assert (high >= low * (1 - 1e-6)).all()
+
+
+def test_what_is_as_likely_far_off_as_not_states_decimeters_and_no_doubt_states_nothing_more() -> None:
+    clip, tracks, lifted = case()
+    doubts = np.full((T, M), -1, np.float32)
+    untold = stated_error(clip, replace(tracks, doubt=doubts), lifted)
+    np.testing.assert_array_equal(untold, stated_error(clip, tracks, lifted))
+    doubts[3:, 1] = 0.5
+    doubted = stated_error(clip, replace(tracks, doubt=doubts), lifted)
+    assert (doubted[3:, 1] > 0.2).all()
+    np.testing.assert_array_equal(doubted[:3], untold[:3])
+    measured = replace(lifted, source=np.full((T, M), int(PositionSource.MEASURED), np.uint8))
+    assert (stated_error(clip, replace(tracks, doubt=doubts), measured) < 0.02).all(), "it is the model that is doubted"
+
+
 def test_the_worlds_frame_does_not_matter() -> None:
     T_world_cam = rigid(np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]]), np.array([0.3, -1.0, 2.0]))
     here, there = stated_error(*case()), stated_error(*case(T_world_cam=T_world_cam))
