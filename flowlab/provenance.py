@@ -53,9 +53,9 @@ class Provenance(Settings):
     camera: Mapping[str, Any] = {}
     """K [px] and T_world_cam, see :class:`flowlab.geometry.camera.Camera`; empty where every episode has its own."""
     state: tuple[Channels, ...] | None = None
-    """What the numbers of the state mean; None where that is not known."""
+    """What the numbers of the state mean; None where that is not known, empty where there is no state."""
     action: tuple[Channels, ...] | None = None
-    """What the numbers of the action mean; None where that is not known."""
+    """What the numbers of the action mean; None where that is not known, empty where there are no actions."""
     action_limits: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Least and greatest value of every number of an action, as executed; None where that is not known."""
     observer: Mapping[str, Any] | None = None
@@ -92,6 +92,8 @@ class Provenance(Settings):
             What does not fit, in words; empty where everything does.
         """
         for what, channels, width in (("state", self.state, state), ("action", self.action, action)):
+            if channels == () and width:
+                return f"{what}: is said not to be there, and has {width} numbers"
             for c in channels or ():
                 if width is not None and max(c.index) >= width:
                     return f"{what}: the channel '{cut(c.name)}' has number {max(c.index)}, and there are {width}"

@@ -52,7 +52,8 @@ def info(dataset: Path, as_json: bool) -> None:
         recordings |= {} if checks is None else {"checks": facts_of_checks(checks)}
         more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats}
         print_json(
-            {**about, **more, "settings": manifest["settings"], "provenance": manifest["provenance"]} | recordings
+            {**about, **more, "settings": manifest["settings"], "provenance": data.provenance.model_dump(mode="json")}
+            | recordings
         )
         return
     for name, value in about.items():
@@ -81,7 +82,8 @@ def _numbers(values: list[float]) -> str:
 def validate(folder: Path, as_json: bool) -> None:
     """Check a dataset, a training run or an experiment: one line for each finding, exit code 3 if there is any.
 
-    What spoke against a recording when it was labeled, too little to refuse it, is a warning on the error output.
+    What is no fault is a warning on the error output: that there are no actions to learn, and what spoke against a
+    recording when it was labeled, too little to refuse it.
     """
     findings = []
     for finding in _findings_of(folder):
@@ -117,10 +119,14 @@ def _warn_of_doubts(folder: Path) -> None:
     from flowlab.pipeline.kept_checks import total_checks
     from flowlab.storage.dataset import Dataset
     from flowlab.storage.manifest import MANIFEST
+    from flowlab.storage.trainable import missing_actions
 
     totals = None
     with suppress(FlowlabError):
-        totals = total_checks(Dataset(folder)) if (folder / MANIFEST).is_file() else None
+        dataset = Dataset(folder) if (folder / MANIFEST).is_file() else None
+        if dataset is not None and (without := missing_actions(dataset)):
+            say(f"warning: {folder}: {without}")
+        totals = None if dataset is None else total_checks(dataset)
     if totals is None:
         return
     for episode in totals.doubtful:

@@ -22,6 +22,7 @@ from flowlab.cli.paths import PATH
 @click.option("--recipe", default="metaworld", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: observer.points=512.")
 @click.option("--renderer", type=click.Choice(["zbuffer", "gl"]), help="Short for --set expert.scene.renderer=...")
+@click.option("--without", metavar="WHAT", help="Leave out 'actions', 'state' or 'actions,state', as films do.")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, with an estimate; write nothing.")
@@ -36,6 +37,7 @@ def extract_sim(
     recipe: str,
     overrides: tuple[str, ...],
     renderer: str | None,
+    without: str | None,
     shard: str,
     repair: bool,
     dry_run: bool,
@@ -47,6 +49,7 @@ def extract_sim(
       flowlab extract-sim hammer push --episodes 10 --out data/demo
       flowlab extract-sim --group hard --out data/hard --workers 4
       flowlab extract-sim hammer --recipe metaworld-dp3 --out data/dp3
+      flowlab extract-sim push --episodes 47 --without actions,state --out data/films
 
     An existing dataset with the same settings is continued or extended; ended early, the same command
     does the rest.
@@ -58,14 +61,17 @@ def extract_sim(
     chosen = [*tasks, *select_tasks([], groups)]
     changes = [*overrides, *([f"expert.scene.renderer={renderer}"] if renderer else [])]
     share = JobShard.parse(shard)
+    left_out = [] if without is None else [name.strip() for name in without.split(",")]
     if dry_run:
-        _dry_run(chosen, out, as_json, episodes=episodes, recipe=recipe, settings=changes, workers=workers)
+        about = {"episodes": episodes, "recipe": recipe, "settings": changes, "without": left_out}
+        _dry_run(chosen, out, as_json, **about, workers=workers)
         return
     start = time.monotonic()
     with ProgressBar(quiet=as_json) as bar:
         dataset = extract(
-            chosen, out, episodes=episodes, recipe=recipe, settings=changes, engine=engine, workers=workers,
-            shard=share, repair=repair, on_progress=lambda progress: show_extraction(bar, progress, "extracting"),
+            chosen, out, episodes=episodes, recipe=recipe, settings=changes, without=left_out,
+            engine=engine, workers=workers, shard=share, repair=repair,
+            on_progress=lambda progress: show_extraction(bar, progress, "extracting"),
         )  # fmt: skip
     from flowlab.cli.reports import finish_extraction
 

@@ -1,5 +1,6 @@
 """Datasets of simulated demonstrations: make one, or say what that would take."""
 
+import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -8,9 +9,9 @@ from pathlib import Path
 
 from flowlab.arguments import check_names, check_optional_count, check_path, check_settings
 from flowlab.engines.base import core_count
-from flowlab.errors import FlowlabError, UsageError
+from flowlab.errors import FlowlabError, UsageError, unknown_name
 from flowlab.pipeline.filling import engine_for, fill
-from flowlab.pipeline.recipe import Recipe, load_recipe
+from flowlab.pipeline.recipe import Recipe, load_recipe, parse_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, SeedScheduler
 from flowlab.pipeline.stage import EpisodeRequest, Rejected
 from flowlab.pipeline.units import JobShard
@@ -28,6 +29,7 @@ def extract(
     episodes: int | None = None,
     recipe: str | Recipe = "metaworld",
     settings: Iterable[str] = (),
+    without: Iterable[str] | str = (),
     engine: str = "local",
     workers: int | None = None,
     shard: JobShard | str = JobShard(),
@@ -42,6 +44,8 @@ def extract(
         episodes: Successful episodes of each task; None for as many as the recipe says.
         recipe: Name of a recipe that comes with flowlab, path of a YAML file, or a recipe.
         settings: Changes of single settings, ``observer.points=512``.
+        without: What to leave out, ``actions`` or ``state`` or both, as in films of a robot; see
+            :func:`flowlab.label_actions`.
         engine: Where it is done: the name of an engine.
         workers: Processes; None for one for each core.
         shard: The part to do, for jobs that fill one dataset together: ``0/4``.
@@ -56,7 +60,7 @@ def extract(
         DataError: The folder holds a dataset that was made with other settings.
         UnfinishedError: Some units failed; the dataset is whole, and the same call does the rest.
     """
-    chosen, names = _prepare(tasks, episodes, recipe, settings)
+    chosen, names = _prepare(tasks, episodes, recipe, settings, without)
     plan = SeedScheduler(dict.fromkeys(names, chosen.episodes), chosen.first_seed)
     return fill(
         chosen,
@@ -95,6 +99,7 @@ def estimate(
     episodes: int | None = None,
     recipe: str | Recipe = "metaworld",
     settings: Iterable[str] = (),
+    without: Iterable[str] | str = (),
     workers: int | None = None,
 ) -> ExtractionEstimate:
     """What :func:`extract` would do, timed on the first seed of the first task; nothing is written.
@@ -105,7 +110,7 @@ def estimate(
     Raises:
         FlowlabError: The episode that would be timed is rejected.
     """
-    chosen, names = _prepare(tasks, episodes, recipe, settings)
+    chosen, names = _prepare(tasks, episodes, recipe, settings, without)
     pipeline = chosen.pipeline()
     request = EpisodeRequest(task=names[0], seed=chosen.first_seed)
     try:
@@ -149,7 +154,11 @@ def manifest_for(recipe: Recipe, tasks: tuple[str, ...]) -> Manifest:
 
 
 def _prepare(
-    tasks: Iterable[str] | str, episodes: int | None, recipe: str | Recipe, settings: Iterable[str]
+    tasks: Iterable[str] | str,
+    episodes: int | None,
+    recipe: str | Recipe,
+    settings: Iterable[str],
+    without: Iterable[str] | str,
 ) -> tuple[Recipe, tuple[str, ...]]:
     """The recipe with its changes, and the names of the tasks."""
     load_mujoco()
@@ -157,9 +166,25 @@ def _prepare(
 
     episodes = check_optional_count(episodes, "episodes")
     changes = [*check_settings(settings), *([f"episodes={episodes}"] if episodes is not None else [])]
-    chosen = load_recipe(recipe, changes)
+    chosen = _withholding(load_recipe(recipe, changes), check_names(without, "without"))
     asked = check_names(tasks, "tasks") or chosen.tasks
     names = tasks_named(asked)
     if not names:
         raise UsageError("name the tasks to extract, as in 'flowlab extract-sim hammer push --out data/demo'")
     return chosen, names
+
+
+_WITHOUT = {"actions": "action", "state": "state"}
+
+
+def _withholding(recipe: Recipe, what: Iterable[str]) -> Recipe:
+    """The recipe, with a stage before its last that leaves something out."""
+    names = [*what]
+    for name in names:
+        if name not in _WITHOUT:
+            raise unknown_name("thing to leave out", name, _WITHOUT)
+    if not names:
+        return recipe
+    values = json.loads(recipe.model_dump_json())
+    values["stages"].insert(-1, {"stage": "withhold", "what": sorted({_WITHOUT[name] for name in names})})
+    return parse_recipe(json.dumps(values), recipe.name, folder=recipe.folder)

@@ -18,7 +18,7 @@ from flowlab.storage import stats
 from flowlab.storage.card import dataset_card
 from flowlab.storage.episodes import EpisodeRef, EpisodeSequence, checked, unit_refs, unit_shard
 from flowlab.storage.manifest import MANIFEST, Manifest, differences
-from flowlab.storage.receipts import check_row_formats, read_receipts
+from flowlab.storage.receipts import RowFormat, check_row_formats, read_receipts
 from flowlab.storage.recorded import number_recordings
 from flowlab.storage.schema import SCHEMA_VERSION
 from flowlab.storage.shard import REPAIR, Shard
@@ -79,9 +79,17 @@ class Dataset(EpisodeSequence):
         return sorted((ref for r in self.receipts for ref in unit_refs(r)), key=lambda ref: (ref.task, ref.seed))
 
     @property
+    def row_format(self) -> RowFormat | None:
+        """What a state and an action are made of; None where that is not known, as of a dataset without episodes."""
+        return next((r.row_format for r in self.receipts if r.row_format is not None), None)
+
+    @cached_property
     def provenance(self) -> Provenance:
-        """Where the episodes come from, and what their numbers mean."""
-        return self.manifest.provenance
+        """Where the episodes come from, and what their numbers mean. That recordings came without state or without
+        actions is known only when they have been opened."""
+        known, said = self.row_format, self.manifest.provenance
+        none: dict[str, Any] = {name: () for name in ("state", "action") if known and not getattr(known, name)}
+        return said.model_copy(update={name: x for name, x in none.items() if getattr(said, name) is None})
 
     def episode(self, index: int) -> Episode:
         """The episode at a position of :attr:`refs`.

@@ -17,7 +17,7 @@ from flowlab.storage.receipts import Receipt
 from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION
 from flowlab.storage.shard import REPAIR, Shard, episode_digest
 from flowlab.storage.stats import differing_stats, summarize
-from flowlab.storage.trainable import training_problems
+from flowlab.storage.trainable import row_problems
 from flowlab.untrusted import read_text
 from flowlab.version import __version__
 
@@ -99,7 +99,7 @@ def _check_books(dataset: Dataset) -> Iterator[Finding]:
         asked = dataset.manifest.requested[task]
         problem = f"{task}: {asked - missing} of {asked} {what}; run the same extract command again for the rest"
         yield Finding(str(path / MANIFEST), problem)
-    yield from (Finding(str(path), problem) for problem in training_problems(dataset))
+    yield from (Finding(str(path), problem) for problem in row_problems(dataset))
     kept = {r.rejects_shard for r in dataset.receipts if any(x.position is not None for x in r.rejects)}
     counted = kept | {r.shard for r in dataset.receipts if r.accepted}
     for shard in sorted([*(path / "shards").glob("*.zarr*"), *(path / "rejects").glob("*.zarr*")]):

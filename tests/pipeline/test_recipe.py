@@ -97,7 +97,7 @@ SENTENCES = {
     "unknown stage": (recipe_of("expert", "obsever"), "no stage is called 'obsever'; did you mean observer?"),
     "unlike any stage": (
         recipe_of("xyz"),
-        "there are: accept, expert, lift, observer, quality, queries, recording, rigid-flow, track, write",
+        "there are: accept, expert, lift, observer, quality, queries, recording, rigid-flow, track, withhold, write",
     ),
     "unknown setting": (
         recipe_of("expert", {"stage": "observer", "point": 5}),

@@ -7,9 +7,11 @@ import numpy as np
 import zarr
 from numcodecs import Blosc
 
+from flowlab.errors import DataError
 from flowlab.files import new_folder
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.base import Exporter, select_episodes
+from flowlab.storage.trainable import missing_actions
 
 _ARRAYS = ("state", "action", "point_cloud")
 _ROWS_TO_A_CHUNK = 100
@@ -29,6 +31,8 @@ class DP3Exporter(Exporter):
     def export(self, dataset: Dataset, path: Path, task: str | None = None) -> int:
         """Write the store; see :class:`~flowlab.storage.exporters.base.Exporter`."""
         chosen = select_episodes(dataset, path, task)
+        if problem := missing_actions(dataset):
+            raise DataError(f"{dataset.path}: {problem}")
         ends = np.cumsum([ref.frames for ref in chosen], dtype=np.int64)
         start = {(ref.task, ref.seed): int(end) - ref.frames for ref, end in zip(chosen, ends, strict=True)}
         with new_folder(path) as temporary:
