@@ -12,6 +12,7 @@ os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", "")
 
 if TYPE_CHECKING:
     from flowlab import data
+    from flowlab.actions.labeling import label_actions
     from flowlab.demonstrations import Demonstration
     from flowlab.deployment.robot_policy import Policy
     from flowlab.errors import (
@@ -53,6 +54,7 @@ _LAZY = {
     **dict.fromkeys(("Dataset", "open_dataset"), "flowlab.storage.dataset"),
     "extract": "flowlab.pipeline.extraction",
     "label": "flowlab.pipeline.labeling",
+    "label_actions": "flowlab.actions.labeling",
     **dict.fromkeys(("TrainedRun", "train"), "flowlab.training.train"),
     "evaluate": "flowlab.evaluation.evaluate",
     "grade": "flowlab.grading.run",
@@ -116,6 +118,7 @@ __all__ = [
     "extract",
     "grade",
     "label",
+    "label_actions",
     "open_dataset",
     "train",
 ]

@@ -40,6 +40,37 @@ class Channels(Settings):
         return self
 
 
+class ChannelError(Settings):
+    """How well a number of the state or action was inferred for demonstrations that were left out."""
+
+    array: Literal["state", "action"]
+    index: NonNegativeInt
+    mean_error: float
+    """Mean absolute error, in the unit of the array."""
+    varies: float
+    """Standard deviation of the number itself."""
+    within_sigma: float
+    """The share of errors within their stated size, calibrated on the other demonstrations; 0.68 is meant."""
+
+
+class Inferred(Settings):
+    """State or actions that nobody recorded: inferred from motion, see :func:`flowlab.label_actions`."""
+
+    what: tuple[Literal["state", "action"], ...]
+    films: str
+    """Path of the dataset that they were inferred for."""
+    labeled: str
+    """Path of the labeled demonstrations that taught it."""
+    fingerprint: str
+    """Of these demonstrations."""
+    method: str
+    """By what, in words."""
+    demonstrations: Mapping[str, NonNegativeInt]
+    """How many of each task."""
+    left_out: Mapping[str, tuple[ChannelError, ...]]
+    """By task, the errors on labeled demonstrations that were left out one at a time."""
+
+
 class Provenance(Settings):
     """Where the episodes of a dataset come from. What is not known is None or empty, and never guessed."""
 
@@ -66,6 +97,8 @@ class Provenance(Settings):
     """Whether tracks are the simulator's own, or estimated from pictures, with a stated error."""
     tracker: str = ""
     """Name of what estimated them."""
+    inferred: Inferred | None = None
+    """What of state and action was inferred from motion; None where all was recorded or simulated."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:

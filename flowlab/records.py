@@ -272,6 +272,11 @@ class Episode(Record):
     rgb: UInt8[np.ndarray, "T H W 3"] | None = None
     extras: Mapping[str, Any] = field(default_factory=dict)
     T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
+    state_sigma: Float32[np.ndarray, "T S"] | None = None
+    """Stated error of every number of the state, in its unit: 68 % of errors are meant to be below it. None where the
+    state was not inferred."""
+    action_sigma: Float32[np.ndarray, "T A"] | None = None
+    """The same of the action."""
 
     def __len__(self) -> int:
         return len(self.action)

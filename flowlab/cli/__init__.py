@@ -16,6 +16,10 @@ _COMMANDS = {
     "tasks": ("flowlab.cli.tasks:tasks", "List MetaWorld's 50 tasks."),
     "extract-sim": ("flowlab.cli.extract_sim:extract_sim", "Make a 3D-flow dataset of simulated demonstrations."),
     "track-real": ("flowlab.cli.track_real:track_real", "Make a 3D-flow dataset of RGB-D recordings of a robot."),
+    "label-actions": (
+        "flowlab.cli.label_actions:label_actions",
+        "Infer the actions of films from how the robot moves.",
+    ),
     "train": ("flowlab.cli.train:train", "Train a policy on a dataset: 3D FDP, DP3 or MBA."),
     "eval": ("flowlab.cli.evaluate:evaluate", "Let policies act in simulation, and count how often they succeed."),
     "bench": ("flowlab.cli.bench:bench", "Run an experiment: extract, train, evaluate, report."),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def info(dataset: Path, as_json: bool) -> None:
     """Say what a dataset holds and how it was made."""
+    from flowlab.cli.label_actions import print_inferred
     from flowlab.cli.reports import facts_of_checks, print_checks, print_quality
     from flowlab.pipeline.kept_checks import total_checks
     from flowlab.storage.dataset import open_dataset
@@ -67,6 +68,8 @@ def info(dataset: Path, as_json: bool) -> None:
     ]
     print_table(["array", "min", "max", "mean", "std"], limits)
     print_quality(data.stats)
+    if data.provenance.inferred is not None:
+        print_inferred(data.provenance, data.provenance.inferred)
     if checks is not None:
         print_checks(checks)
 

@@ -32,6 +32,7 @@ class BatchBuilder:
         self._start = np.array([e.start for e in buffer.episodes])
         self._stop = np.array([e.stop for e in buffer.episodes])
         self._center = buffer.state[:, channels.gripper].mean(0) if channels.gripper else np.zeros(3)
+        self._action_weight = action_weight(buffer, settings)
         self._queries = np.zeros((len(buffer.episodes), 0), int)
         self._weight = np.zeros((len(buffer.state), 0), np.float32)
         if needs.flow is not None:
@@ -68,6 +69,7 @@ class BatchBuilder:
             observed=torch.from_numpy(observed.reshape(observed_rows.shape)),
             task=torch.from_numpy(self._tasks[windows.episode]),
             action_weight=torch.from_numpy(_mean_one((demonstrated | s.batch.pad).astype(np.float32))),
+            action_confidence=torch.from_numpy(self._confidence(row)),
             flow_weight=torch.from_numpy(flow_weight),
         )
 
@@ -97,6 +99,12 @@ class BatchBuilder:
             pose[..., :3] = scene.transform_points(pose[..., :3], windows.run)
             axes = pose[..., 3:].reshape(*pose.shape[:-1], 2, 3)
             pose[..., 3:] = scene.rotate_vectors(axes, windows.run).reshape(*pose.shape[:-1], 6)
+
+    def _confidence(self, row: Int[np.ndarray, "W T"]) -> Float32[np.ndarray, "W T A"]:
+        """How sure the actions of every window are, where they were inferred."""
+        if self._action_weight is None:
+            return np.ones((*row.shape, self._buffer.action.shape[1]), np.float32)
+        return _mean_one(self._action_weight[row])
 
     def _subsets(self, rng: np.random.Generator | None) -> tuple[Int[np.ndarray, "N"], Any]:
         """Which points of the clouds and which of the queries this batch sees."""
@@ -128,6 +136,14 @@ class BatchBuilder:
         known = (then > row) & demonstrated
         flow[~known] = 0
         return flow, _mean_one(sure * known[..., None])
+
+
+def action_weight(buffer: ReplayBuffer, settings: TrainSettings) -> Float32[np.ndarray, "F A"] | None:
+    """How much every number of every action counts, by its stated error; None where none was inferred."""
+    if buffer.action_sigma is None or not buffer.action_sigma.any():
+        return None
+    half = settings.batch.action_sigma * np.maximum(buffer.action.std(0), 1e-6)
+    return (1 / (1 + (buffer.action_sigma / half) ** 2)).astype(np.float32)
 
 
 def _check_points(settings: TrainSettings, buffer: ReplayBuffer) -> None:

@@ -63,6 +63,8 @@ class Batch(ObservationBatch):
     """In the dataset's units."""
     action_weight: Float[Tensor, "W T"]
     """0 where the demonstration has no such step; the mean over the whole batch is 1."""
+    action_confidence: Float[Tensor, "W T A"]
+    """Less where an inferred action is less sure, for each of its numbers; the mean over the whole batch is 1."""
     flow: Float[Tensor, "W T M 3"]
     """How far each query point moves during each action [m]; M is 0 where the policy needs none."""
     flow_weight: Float[Tensor, "W T M"]

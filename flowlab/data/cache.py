@@ -32,7 +32,7 @@ from flowlab.user_cache import user_cache
 
 INDEX = "index.json"
 """Written last: a folder that has it is whole."""
-_FORMAT = 4
+_FORMAT = 5
 _BLOCK = 16 << 20
 """Bytes that are looked at together."""
 _LOG = logging.getLogger(__name__)

@@ -50,6 +50,8 @@ class ReplayBuffer:
     queries: Float32[np.ndarray, "E Q 3"]
     query_role: Int[np.ndarray, "E Q"]
     query_count: Int[np.ndarray, "E 1"]
+    action_sigma: Float32[np.ndarray, "F A"] | None = None
+    """Stated error of inferred actions, 0 for recorded ones; None where all are recorded."""
     rgb: UInt8[np.ndarray, "F H W 3"] | None = None
     """Color pictures; None where they were not asked for, or the dataset has none."""
     depth: Float32[np.ndarray, "F H W"] | None = None
@@ -97,6 +99,7 @@ def arrays_of(e: Episode) -> tuple[Mapping[str, np.ndarray], Mapping[str, np.nda
         "point_count": e.point_count,
         "state": e.state,
         "action": e.action,
+        "action_sigma": np.zeros(e.action.shape, np.float32) if e.action_sigma is None else e.action_sigma,
         "success": e.success,
         "time": e.time_s,
         "tracks": tracks.xyz_world,

@@ -169,6 +169,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         found."""
         names = {n for n, a in arrays.items() if n not in _PER_EPISODE and 0 not in a.shape[1:]}
         names -= {"sigma"} if not arrays["estimated"].any() else set()
+        names -= {"action_sigma"} if not arrays["action_sigma"].any() else set()
         names |= {"flow"} if "tracks" in names else set()
         names -= set(_UNKNOWN_IN_IMPORTS) if source.provenance.kind == "imported" else set()
         for folder in self._folders[1:]:

@@ -48,6 +48,27 @@ def fill(
     Raises :class:`UnfinishedError` where units failed, and :class:`FlowlabError` where going on is useless;
     the dataset is whole in either case.
     """
+
+    def work_for(manifest: Manifest) -> Callable[[WorkUnit], Receipt]:
+        return partial(run_unit, recipe.model_dump_json(), recipe.folder, manifest.settings_digest, folder)
+
+    return fill_by(
+        work_for, manifest, plan_for, folder, start_engine=start_engine, share=share, report=report, repair=repair
+    )
+
+
+def fill_by(
+    work_for: Callable[[Manifest], Callable[[WorkUnit], Receipt]],
+    manifest: Manifest,
+    plan_for: Callable[[Manifest], UnitScheduler],
+    folder: Path,
+    *,
+    start_engine: StartEngine[WorkUnit, Receipt],
+    share: JobShard,
+    report: Callable[[ExtractionProgress], None],
+    repair: bool = False,
+) -> Dataset:
+    """The same, where a unit is done by what ``work_for`` gives for the manifest as it is on disk."""
     log = folder / "failures.log"
     try:
         manifest = begin(folder, manifest)
@@ -58,9 +79,8 @@ def fill(
         raise
     except OSError as error:
         raise _storage_error(folder, error) from error
-    work = partial(run_unit, recipe.model_dump_json(), recipe.folder, manifest.settings_digest, folder)
     try:
-        with start_engine(work) as engine:
+        with start_engine(work_for(manifest)) as engine:
             failures = run_all(engine, plan_for(manifest), folder, share, report)
         dataset = summarize(folder)
     except MissingFileError:

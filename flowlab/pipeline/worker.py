@@ -2,7 +2,7 @@
 
 import resource
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from flowlab.storage.receipts import (
     Receipt,
     Reject,
     RowFormat,
+    StageTally,
     common_format,
     keep_receipt,
     known_row_format,
@@ -56,11 +57,40 @@ def run_unit(
             about = request.model_dump()
             why = {"stage": rejected.stage, "reason": rejected.reason, "retry": rejected.retry}
             rejects.append(Reject(**about, **why, position=position))
+    return keep_unit(
+        folder, unit, episodes, rejects, kept, store=pipeline.store, settings_digest=settings_digest,
+        stages=lambda: {name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
+    )  # fmt: skip
+
+
+def keep_unit(
+    folder: Path,
+    unit: WorkUnit,
+    episodes: Sequence[Episode],
+    rejects: Sequence[Reject],
+    kept: Sequence[Episode],
+    *,
+    store: Callable[[Path, Sequence[Episode], str], None],
+    settings_digest: str,
+    stages: Callable[[], Mapping[str, StageTally]],
+) -> Receipt:
+    """Write what became of a unit: its shard, and then its receipt.
+
+    Args:
+        folder: Of the dataset.
+        unit: What was to be made.
+        episodes: Those that are good.
+        rejects: Why others are not.
+        kept: Rejected episodes that people may look at.
+        store: Writes episodes into a shard.
+        settings_digest: What the shard says of the settings.
+        stages: What the stages did, asked for when all is stored.
+    """
     known = known_row_format(folder)
     with nullcontext() if known else locked(folder):  # the first episodes decide, and only one unit has them
         episodes, misfits = _fitting(episodes, known or known_row_format(folder), unit)
         checksums = {
-            place: _store(pipeline, folder, place, unit.name, found, settings_digest)
+            place: _store(store, folder, place, unit.name, found, settings_digest)
             for place, found in (("shards", episodes), ("rejects", kept))
         }
         common = common_format(map(RowFormat.of, episodes))
@@ -75,7 +105,7 @@ def run_unit(
             shard_sha256=checksums["shards"],
             rejects_sha256=checksums["rejects"],
             rejects=(*rejects, *misfits),
-            stages={name: tally.since(before[name]) for name, tally in pipeline.tallies.items()},
+            stages=stages(),
             state_names=common.state_names if common else (),
             action_names=common.action_names if common else (),
             stats=stats.summarize(episodes) if episodes else {},
@@ -119,7 +149,12 @@ def _fitting(
 
 
 def _store(
-    pipeline: Pipeline, folder: Path, place: str, unit: str, episodes: list[Episode], settings_digest: str
+    store: Callable[[Path, Sequence[Episode], str], None],
+    folder: Path,
+    place: str,
+    unit: str,
+    episodes: Sequence[Episode],
+    settings_digest: str,
 ) -> str:
     """Write a shard, and its SHA-256; where there is nothing to write, remove what an earlier try has left."""
     path, folder_shard = (folder / shard_path(place, unit, zipped=zipped) for zipped in (True, False))
@@ -128,7 +163,7 @@ def _store(
     if not episodes:
         path.unlink(missing_ok=True)
         return ""
-    pipeline.store(path, episodes, settings_digest)
+    store(path, episodes, settings_digest)
     return sha256_of(path)
 
 

@@ -102,7 +102,8 @@ class DiffusionPolicy(PolicyNetwork):
         target = target[:, None].expand_as(drawn)
         noised = self.diffusion.noised(target, drawn, step)
         denoised = self.action.denoise(noised.flatten(0, 1), self.action.terms(condition, step)).view(drawn.shape)
-        loss = (self.diffusion.distance(denoised, target) * batch.action_weight[:, None, :, None]).mean()
+        weight = (batch.action_weight[..., None] * batch.action_confidence)[:, None]
+        loss = (self.diffusion.distance(denoised, target) * weight).mean()
         if motion is None:
             return Losses(loss, {"action": loss})
         return Losses(loss + self.motion_weight * motion.loss, {"action": loss, "motion": motion.loss})

@@ -48,8 +48,24 @@ def episode_problems(e: Episode, provenance: Provenance) -> Iterator[ArrayProble
         yield from check(e)
     if provenance.tracks == "estimated" and e.tracks.quality is None:
         yield ArrayProblem("data/sigma", "missing; estimated tracks must state their error")
+    yield from _inferred(e, provenance)
     if provenance.action_limits is not None:
         yield from _beyond_limits(e.action, *map(np.array, provenance.action_limits))
+
+
+def _inferred(e: Episode, provenance: Provenance) -> Iterator[ArrayProblem]:
+    """What was inferred states an error above 0, and nothing else does."""
+    what = () if provenance.inferred is None else provenance.inferred.what
+    for name, sigma in (("state", e.state_sigma), ("action", e.action_sigma)):
+        array = f"data/{name}_sigma"
+        if (sigma is not None) != (name in what):
+            there = f"states errors of a {name} that the manifest does not call inferred"
+            yield ArrayProblem(
+                array, there if sigma is not None else f"missing; an inferred {name} must state its error"
+            )
+        elif sigma is not None and not (sigma > 0).all():
+            t, k = np.argwhere(~(sigma > 0))[0]
+            yield ArrayProblem(array, f"number {k} at step {t} states an error that is not above 0")
 
 
 def _beyond_limits(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[ArrayProblem]:

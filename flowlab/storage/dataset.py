@@ -185,6 +185,9 @@ class Dataset(EpisodeSequence):
 
         Of recordings, those not yet looked at: what was rejected is done with.
         """
+        if self.provenance.inferred is not None:  # films that were kept out are done with, too
+            tried = Counter(r.task for r in self.receipts for _ in r.seeds)
+            return {t: n - tried[t] for t, n in self.manifest.requested.items() if tried[t] < n}
         if self.manifest.recordings:
             done = {(r.task, seed) for r in self.receipts for seed in r.seeds}
             return dict(Counter(r.task for r in self.manifest.recordings if (r.task, r.seed) not in done))

@@ -65,6 +65,15 @@ SCHEMA = (
         "the action executed after the observation of the same row", lambda e: e.action,
     ),
     ArraySpec(
+        "data/state_sigma", "float32", ("time", "state"), "source",
+        "stated error of an inferred state: 68 % of errors are meant to be below it", lambda e: e.state_sigma,
+        optional=True,
+    ),
+    ArraySpec(
+        "data/action_sigma", "float32", ("time", "action"), "source", "the same of an inferred action",
+        lambda e: e.action_sigma, optional=True,
+    ),
+    ArraySpec(
         "data/success", "bool", ("time",), "1", "whether the task counts as solved after the action of the row",
         lambda e: e.success,
     ),

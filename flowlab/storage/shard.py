@@ -175,6 +175,8 @@ class Shard:
             rgb=columns.get("data/rgb"),
             extras=about.extras,
             T_world_cam=columns.get(POSES),
+            state_sigma=columns.get("data/state_sigma"),
+            action_sigma=columns.get("data/action_sigma"),
         )
 
 

@@ -22,8 +22,8 @@ def missing_actions(dataset: Dataset) -> str:
         return ""
     return (
         "the episodes have no actions, so no policy can be trained on them; infer them from motion by 'flowlab "
-        f"label-actions {dataset.path} --from LABELED --out OUT', or name the robot's state or actions in the recordings "
-        "('state', 'action' in recording.yaml, 'topics' of a bag) and make the dataset again"
+        f"label-actions {dataset.path} --from LABELED --out OUT', or name the robot's state or actions in the "
+        "recordings ('state', 'action' in recording.yaml, 'topics' of a bag) and make the dataset again"
     )
 
 

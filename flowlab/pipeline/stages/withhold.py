@@ -25,5 +25,5 @@ class WithholdStage(Stage):
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:
         """There is none of it."""
-        known: dict[str, Any] = {name: () for name in self.what}
+        known: dict[str, Any] = dict.fromkeys(self.what, ())
         return provenance.model_copy(update=known | ({"action_limits": None} if "action" in self.what else {}))

@@ -1,0 +1,108 @@
+"""How far off inferred numbers are: measured on demonstrations that were left out, stated for every step of a film."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from flowlab.actions.kernel import KernelRegression
+from flowlab.provenance import ChannelError
+from flowlab.records import Episode
+
+_ONE_SIGMA = 0.68
+_ROWS = 1200
+"""So many rows tell how an error goes with the gripper's pace."""
+_LEAST_M = 0.0008
+"""No number that was read off a sampled cloud is surer than this [m, or its own unit]."""
+
+
+@dataclass(frozen=True, slots=True)
+class InferredRows:
+    """State and actions of an episode, with spreads that are still to be calibrated."""
+
+    state: Float[np.ndarray, "T S"]
+    action: Float[np.ndarray, "T A"]
+    state_spread: Float[np.ndarray, "T S"]
+    action_spread: Float[np.ndarray, "T A"]
+    pace: Float[np.ndarray, "T d"]
+    """How fast the gripper is, by which the size of an action's error is told."""
+    tracks: int
+    """Tracks that lie on the gripper; 0 where clouds alone told where it is."""
+    fit: float
+    """How well the gripper's shape fits, in the median; 1 is as usual."""
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """By how much spreads are to be multiplied, so that 68 % of errors lie below them."""
+
+    state: Float[np.ndarray, "S"]
+    action: Float[np.ndarray, "A"]
+    size: KernelRegression
+    """Of an action's error over its spread, by the gripper's pace: its logarithm."""
+    errors: tuple[ChannelError, ...]
+    """What was found on the demonstrations left out."""
+    fit: float
+    """How well the gripper's shape fitted there, at the worst."""
+
+    def sigma(self, rows: InferredRows) -> tuple[Float[np.ndarray, "T S"], Float[np.ndarray, "T A"]]:
+        """The stated errors of state and action."""
+        return np.maximum(rows.state_spread * self.state, _LEAST_M), _sized(rows, self.size) * self.action
+
+
+def calibrate(truth: Sequence[Episode], guessed: Sequence[InferredRows]) -> Calibration:
+    """Compare what was inferred of demonstrations that were left out with what is known of them.
+
+    Args:
+        truth: The demonstrations.
+        guessed: What was inferred of each by what the others taught.
+    """
+    every = range(len(truth))
+    scaled = [_sized(g, _size(truth, guessed, [j for j in every if j != k])) for k, g in enumerate(guessed)]
+    state, state_errors = _calibrated("state", truth, [g.state for g in guessed], [g.state_spread for g in guessed])
+    action, action_errors = _calibrated("action", truth, [g.action for g in guessed], scaled)
+    few = (len(truth) + 1) / len(truth)  # of few demonstrations, the worst was hardly seen
+    return Calibration(
+        state * few, action, _size(truth, guessed, every), (*state_errors, *action_errors), min(g.fit for g in guessed)
+    )
+
+
+def _size(truth: Sequence[Episode], guessed: Sequence[InferredRows], used: Sequence[int]) -> KernelRegression:
+    """How an action's error over its spread, in logarithms, goes with the gripper's pace."""
+    off = np.concatenate([np.abs(guessed[k].action - truth[k].action) for k in used])
+    spread, x = (np.concatenate([getattr(guessed[k], n) for k in used]) for n in ("action_spread", "pace"))
+    step = -(-len(x) // _ROWS)
+    y = np.log(off + 0.02 * spread) - np.log(spread)
+    return KernelRegression.fit(x[::step], y[::step], ridge=3.0, sharpness=1.0)
+
+
+def _sized(rows: InferredRows, size: KernelRegression) -> np.ndarray:
+    """The spread of actions, given the gripper's pace."""
+    return rows.action_spread * np.exp(size.predict(rows.pace))
+
+
+def _calibrated(
+    array: Literal["state", "action"],
+    truth: Sequence[Episode],
+    guessed: Sequence[np.ndarray],
+    spread: Sequence[np.ndarray],
+) -> tuple[Float[np.ndarray, "C"], list[ChannelError]]:
+    """What spreads are to be multiplied with, and what was found of every number."""
+    off = [np.abs(g - getattr(t, array)) for g, t in zip(guessed, truth, strict=True)]
+    ratio = [o / np.maximum(s, 1e-9) for o, s in zip(off, spread, strict=True)]
+    factor = np.quantile(np.concatenate(ratio), _ONE_SIGMA, axis=0)
+    within = [
+        r <= np.quantile(np.concatenate([x for j, x in enumerate(ratio) if j != k]), _ONE_SIGMA, axis=0)
+        for k, r in enumerate(ratio)
+    ]
+    mean, share = np.concatenate(off).mean(0), np.concatenate(within).mean(0)
+    varies = np.concatenate([getattr(t, array) for t in truth]).std(0)
+    errors = [
+        ChannelError(
+            array=array, index=c, mean_error=float(mean[c]), varies=float(varies[c]), within_sigma=float(share[c])
+        )
+        for c in range(len(mean))
+    ]
+    return np.maximum(factor, 1e-6), errors

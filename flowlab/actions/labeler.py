@@ -1,0 +1,109 @@
+"""Actions by what the robot is seen to do, as labeled demonstrations of a task teach it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from flowlab.actions.calibration import Calibration, InferredRows, calibrate
+from flowlab.actions.inverse import InverseModel, Motion, disturbed, fit_inverse, motion_of
+from flowlab.actions.robot import GripperPath, RobotLayout
+from flowlab.actions.sight import RobotSight, SeenRobot, known_robot, learn_sight, see_robot
+from flowlab.records import Episode
+
+_MOST_LEFT_OUT = 5
+"""More demonstrations than this are not left out in turn: the rest would tell the same."""
+_LEAST_SPREAD = 0.02
+"""Of what a number of the action varies by: no action is inferred better."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActionLabeler:
+    """All that labeled demonstrations of a task taught."""
+
+    layout: RobotLayout
+    sight: RobotSight | None
+    """None where films have a state of their own."""
+    inverse: InverseModel
+    rest_unit: Float[np.ndarray, "r"]
+    like: tuple[np.ndarray, np.ndarray]
+    """A state and an action of the demonstrations."""
+    calibration: Calibration
+
+    def infer(self, episode: Episode) -> InferredRows:
+        """State and actions of a film."""
+        seen = known_robot(episode, self.layout) if self.sight is None else see_robot(self.sight, episode)
+        return _infer(self.inverse, self.layout, seen, self.rest_unit, self.like)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """A labeled demonstration as it is known, or as it was seen by what the others taught."""
+
+    motion: Motion
+    path: GripperPath
+    action: np.ndarray
+
+
+def learn_labeler(demos: Sequence[Episode], layout: RobotLayout, *, find: bool, seed: int = 0) -> ActionLabeler:
+    """Learn to label films of a task, and measure on demonstrations that are left out how well that goes.
+
+    The inverse model learns from demonstrations as they are known, and as they are seen when they are left out, since
+    that is how films are seen.
+
+    Args:
+        demos: At least two.
+        layout: What the numbers of their state and action are.
+        find: Whether the gripper is to be found in clouds, for films without state.
+        seed: Of all randomness.
+
+    Raises:
+        DataError: Their clouds do not show a gripper.
+    """
+    state, action = (np.concatenate([getattr(e, name) for e in demos]).astype(float) for name in ("state", "action"))
+    unit, like = np.maximum(layout.rest(state).std(0), 1e-6), (state[0], action[0])
+    known = [_sample(layout, e, known_robot(e, layout), unit) for e in demos]
+    out = np.unique(np.linspace(0, len(demos) - 1, min(len(demos), _MOST_LEFT_OUT)).astype(int)).tolist()
+    seen: dict[int, SeenRobot] = {}
+    for k in out:
+        others = [e for j, e in enumerate(demos) if j != k]
+        seen[k] = see_robot(learn_sight(others, layout, seed), demos[k]) if find else known_robot(demos[k], layout)
+    again = {k: _sample(layout, demos[k], seen[k], unit) for k in out} if find else {}
+
+    def inverse(without: int | None = None) -> InverseModel:
+        samples = [s for j, s in enumerate(known) if j != without] + [s for j, s in again.items() if j != without]
+        return _fit(layout, samples, seed)
+
+    guessed = [_infer(inverse(k), layout, seen[k], unit, like) for k in out]
+    calibration = calibrate([demos[k] for k in out], guessed)
+    return ActionLabeler(layout, learn_sight(demos, layout, seed) if find else None, inverse(), unit, like, calibration)
+
+
+def _sample(layout: RobotLayout, demo: Episode, seen: SeenRobot, unit: np.ndarray) -> _Sample:
+    return _Sample(motion_of(layout, seen.path.path, seen.rest, unit), seen.path.path, demo.action.astype(float))
+
+
+def _fit(layout: RobotLayout, samples: Sequence[_Sample], seed: int) -> InverseModel:
+    motion = Motion.join([s.motion for s in samples])
+    path = GripperPath.join([s.path for s in samples])
+    action = np.concatenate([s.action for s in samples])
+    return fit_inverse(layout, motion, path, action, np.random.default_rng(seed))
+
+
+def _infer(
+    inverse: InverseModel, layout: RobotLayout, seen: SeenRobot, unit: np.ndarray, like: tuple[np.ndarray, np.ndarray]
+) -> InferredRows:
+    path = seen.path.path
+    motion = motion_of(layout, path, seen.rest, unit)
+    off = disturbed(inverse, layout, seen, unit, np.random.default_rng(0))
+    novel = inverse.novelty(motion)[:, None] * inverse.unit
+    return InferredRows(
+        state=layout.state(path, seen.rest, like[0]),
+        action=inverse.infer(motion, path, like[1]),
+        state_spread=seen.state_spread(layout),
+        action_spread=np.sqrt(off**2 + novel**2 + (_LEAST_SPREAD * inverse.unit) ** 2),
+        pace=motion.pace(),
+        tracks=seen.path.tracks,
+        fit=seen.fit,
+    )
