@@ -83,8 +83,8 @@ def labeled_layout(labeled: Dataset) -> Callable[[Sequence[Episode]], RobotLayou
         layout = layout_of(channels, np.asarray(buffer.state), np.asarray(buffer.action), stated=stated)
     if layout is None:
         raise DataError(
-            f"{labeled.path}: does not tell where the gripper is in the frame of its clouds: the provenance must name a "
-            "position of the state in the frame 'world', or tracks must move with the state's first three numbers"
+            f"{labeled.path}: does not tell where the gripper is in the frame of its clouds: the provenance must name "
+            "a position of the state in the frame 'world', or tracks must move with the state's first three numbers"
         )
     return lambda demos: sharpest(demos, layout)
 

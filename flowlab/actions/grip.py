@@ -66,7 +66,7 @@ def fit_grip(
     frames = np.arange(len(path))
     if len(frames) > MOST_ROWS // 2:
         frames = np.sort(rng.choice(frames, MOST_ROWS // 2, replace=False))
-    chosen, some = [clouds[k] for k in frames], path.rows(frames)
+    chosen, some = [clouds[int(k)] for k in frames], path.rows(frames)
     moved = some.moved_to(some.position + rng.normal(0, _JITTER_M, (len(frames), 3)))
     x = np.concatenate([_felt(nodes, chosen, some), _felt(nodes, chosen, moved)])
     y = np.concatenate([rest[frames]] * 2)

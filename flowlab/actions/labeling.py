@@ -219,7 +219,9 @@ def _label_unit(
 ) -> Receipt:
     """Label the films of a unit, in a worker."""
     start, dataset = time.process_time(), Dataset(films)
-    episodes, kept, rejects = [], [], []
+    episodes: list[Episode] = []
+    kept: list[Episode] = []
+    rejects: list[Reject] = []
     for k, ref in enumerate(dataset.refs):
         if ref.task == unit.task and ref.seed in unit.seeds:
             labeled, reason = label_film(labelers[unit.task], dataset[k], settings)

@@ -58,7 +58,7 @@ def refine_path(found: GripperPath, tracks: Tracks3D) -> RefinedPath:
     xyz, weight = tracks.xyz_world[:, chosen].astype(float), seen / (sigma[:, chosen] ** 2 + _FLOOR_M**2)
     path = found
     for _ in range(_ROUNDS):
-        path = _anchored(_follow(path, xyz, weight), found, seen.any(1))
+        path = _anchored(_follow(path, xyz, weight), found, np.asarray(seen.any(1)))
     return _with_spread(path, found, xyz, weight)
 
 

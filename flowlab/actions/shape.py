@@ -115,7 +115,7 @@ def _guesses(shape: GripperShape, cloud: np.ndarray) -> list[GripperPath]:
     """Poses of demonstrations, and the same rotations at places of the cloud."""
     known = [shape.starts.rows(np.array([k])) for k in range(len(shape.starts))]
     places = cloud[farthest_points(cloud.astype(np.float32), min(_STARTS, len(cloud)))].astype(float)
-    nearest = cKDTree(shape.starts.position).query(places)[1]
+    nearest = np.asarray(cKDTree(shape.starts.position).query(places)[1])
     return known + [known[k].moved_to(place[None]) for k, place in zip(nearest, places, strict=True)]
 
 
@@ -132,7 +132,7 @@ def _lay(shape: GripperShape, cloud: np.ndarray, pose: GripperPath) -> tuple[Gri
     used = np.zeros(len(near), bool)
     for limit in _NEAR_M:
         x = near - position if R is None else (near - position) @ R
-        distance, index = shape.tree.query(x, distance_upper_bound=limit)
+        distance, index = map(np.asarray, shape.tree.query(x, distance_upper_bound=limit))
         used = np.isfinite(distance)
         if used.sum() < _LEAST:
             return pose, 0.0, 0.0

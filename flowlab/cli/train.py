@@ -32,7 +32,7 @@ class PluginOption(click.Option):
 
 
 @click.command()
-@click.argument("source", type=PATH)
+@click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
 @click.option("--policy", cls=PluginOption, registry=POLICIES, help="What to train.")
 @click.option("--out", type=PATH, help="Folder of the run.")
 @click.option("--profile", help="fast, paper, or a YAML file with the settings that differ  [fast].")
@@ -50,7 +50,7 @@ class PluginOption(click.Option):
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
 def train(
-    source: Path,
+    sources: tuple[Path, ...],
     policy: str | None,
     out: Path | None,
     profile: str | None,
@@ -66,15 +66,17 @@ def train(
     logs: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Train a policy on the dataset SOURCE.
+    """Train a policy on the dataset SOURCE, or on several.
 
     \b
       flowlab train data/push --policy fdp --out runs/push-fdp
       flowlab train data/push --policy dp3 --profile paper --out runs/push-dp3
+      flowlab train data/push data/films-labeled --policy dp3 --out runs/push-all
       flowlab train runs/push-fdp --resume
       torchrun --nproc-per-node 4 -m flowlab train data/push --policy fdp --out runs/push-fdp
 
-    SOURCE is what extract-sim or track-real made, or, for dp3, a store in DP3's layout.
+    SOURCE is what extract-sim, track-real or label-actions made, or, for dp3, a store in DP3's layout. Several datasets
+    must say the same of their frame, their camera, and what their numbers mean.
 
     --minutes is CPU time of one thread, so that what else the machine does changes nothing; on a GPU it is time by
     the clock. The learning rate falls to zero within it.
@@ -86,9 +88,13 @@ def train(
                  "--seed": seed, "--overfit": overfit, "--from": began_from}  # fmt: skip
         if changed := [name for name, value in given.items() if value not in (None, ())]:
             raise UsageError(f"--resume goes on as the run began, so leave out {', '.join(changed)}")
+        if len(sources) > 1:
+            raise UsageError(
+                f"--resume goes on with one run, and {len(sources)} folders are given; give the run's alone"
+            )
     elif policy is None or out is None:
         raise UsageError(
-            f"say what to train and where to save it, as in 'flowlab train {source} --policy fdp --out runs/fdp'; "
+            f"say what to train and where to save it, as in 'flowlab train {sources[0]} --policy fdp --out runs/fdp'; "
             "--resume goes on with a run"
         )
     from flowlab.training import train as training
@@ -100,13 +106,13 @@ def train(
         watch = training.Watch(_silent if quiet else say, partial(show_training, bar), should_stop)
         if resume:
             done = training.resume(
-                source, device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
+                sources[0], device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
             )
         else:
             assert policy is not None
             assert out is not None
             done = training.train(
-                source, out, policy=policy, profile=profile or "fast", minutes=minutes, settings=overrides, seed=seed,
+                sources, out, policy=policy, profile=profile or "fast", minutes=minutes, settings=overrides, seed=seed,
                 overfit=overfit, began_from=began_from, device=device or "auto", threads=threads or 1,
                 precision=precision or "auto", logs=logs, watch=watch,
             )  # fmt: skip

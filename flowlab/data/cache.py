@@ -88,7 +88,7 @@ def cached_part(source: TrainingSource, fallback: Path | None, part: str, arrays
             with _alone(cache / content) as folder:
                 if not _is_sound(folder / part):
                     _decode(source, folder / part, arrays_of)
-                    _remove_outdated(cache, content, source.path)
+                    _remove_outdated(cache, content, _place_of(source))
             return folder / part
         except FlowlabError:  # that a shard is missing is an OSError, too
             raise
@@ -190,7 +190,7 @@ def _checksum(path: Path) -> int:
     return value
 
 
-def _remove_outdated(cache: Path, content: str, dataset: Path) -> None:
+def _remove_outdated(cache: Path, content: str, dataset: str) -> None:
     """Delete what was decoded of earlier contents of the same dataset: by our own index, and never through a link."""
     for other in cache.iterdir():
         if other.name == content or other.is_symlink() or not other.is_dir():
@@ -202,9 +202,9 @@ def _remove_outdated(cache: Path, content: str, dataset: Path) -> None:
             other.rmdir()  # where it is empty now
 
 
-def _was_decoded_from(folder: Path, dataset: Path) -> bool:
+def _was_decoded_from(folder: Path, dataset: str) -> bool:
     try:
-        return _read_index(folder).dataset == str(dataset.resolve())
+        return _read_index(folder).dataset == dataset
     except DataError:
         return False
 
@@ -254,11 +254,16 @@ class _Decoder:
             array.flush()  # type: ignore[attr-defined]
         names = [*self.arrays, *self.whole[0]]
         index = CacheIndex(
-            dataset=str(self.source.path.resolve()),
+            dataset=_place_of(self.source),
             episodes=tuple(self.episodes[k] for k in order),
             arrays={name: _checksum(self.folder / f"{name}.npy") for name in names},
         )
         write_json(self.folder / INDEX, with_checksum(index.model_dump(mode="json")))
+
+
+def _place_of(source: TrainingSource) -> str:
+    """Where what is decoded lies; several datasets together are none of them."""
+    return ":".join(str(path.resolve()) for path in source.paths)
 
 
 def _decode(source: TrainingSource, folder: Path, arrays_of: ArraysOf) -> None:

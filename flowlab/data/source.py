@@ -2,8 +2,9 @@
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from flowlab.arguments import check_path
@@ -13,7 +14,9 @@ from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
+from flowlab.storage.manifest import differences
 from flowlab.storage.trainable import training_problems
+from flowlab.text import cut
 
 _LOG = logging.getLogger(__name__)
 
@@ -30,20 +33,57 @@ class TrainingSource:
     provenance: Provenance
     cache_key: str
     """Identifies what is read, the names of tasks too."""
+    more: tuple[Path, ...] = ()
+    """Where the rest of it is, if there are several datasets."""
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Where all of it is."""
+        return self.path, *self.more
 
 
-def open_training_source(path: Path) -> TrainingSource:
-    """Open a dataset, or a store in DP3's layout.
+def open_training_source(path: Path, *more: Path) -> TrainingSource:
+    """Open a dataset, or a store in DP3's layout; or several datasets, to be trained on together.
 
     Raises:
-        DataError: The folder is neither, or holds no episodes.
+        DataError: A folder is neither, or holds no episodes, or the datasets do not fit each other.
     """
+    if more:
+        return _joined([Dataset(p) for p in (path, *more)])
     if DP3Store.looks_like(path):
         store = DP3Store(path)
         named = hashlib.sha256(f"{store.fingerprint} {store.task}".encode()).hexdigest()[:16]  # after the folder
         imported = Provenance(kind="imported")
         return TrainingSource(path, store.fingerprint, sum(store.frames), store.episodes, imported, named)
     return source_of(Dataset(path))
+
+
+_ALIKE = ("kind", "world_frame", "camera", "state", "action", "action_limits", "observer", "queries")
+"""What datasets must say alike of themselves to be trained on together."""
+
+
+def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
+    """Several datasets as one. Where episodes come from, and what their numbers mean, must be the same."""
+    first, sources = datasets[0], [source_of(d) for d in datasets]
+    for other in datasets[1:]:
+        if other.path.resolve() in {d.path.resolve() for d in datasets if d is not other}:
+            raise DataError(f"{other.path}: is given twice; leave one out")
+        old, new = ({k: d.provenance.model_dump(mode="json")[k] for k in _ALIKE} for d in (first, other))
+        lines = [*differences(old, new, owners=(str(first.path), str(other.path)))]
+        assert first.row_format is not None
+        assert other.row_format is not None
+        if problem := first.row_format.problem(other.row_format) or (cut(lines[0], 300) if lines else ""):
+            raise DataError(f"{other.path}: cannot be trained on together with {first.path}: {problem}")
+    content = hashlib.sha256(" ".join(s.fingerprint for s in sources).encode()).hexdigest()[:16]
+    return TrainingSource(
+        first.path,
+        content,
+        sum(s.frames for s in sources),
+        lambda: chain.from_iterable(s.episodes() for s in sources),
+        first.provenance,
+        content,
+        tuple(d.path for d in datasets[1:]),
+    )
 
 
 def path_of(data: Dataset | Path | str) -> Path:
@@ -59,6 +99,15 @@ def path_of(data: Dataset | Path | str) -> Path:
             "dataset and episodes=[...]"
         )
     return data.path if isinstance(data, Dataset) else check_path(data, "data")
+
+
+def paths_of(data: "Dataset | Path | str | Sequence[Dataset | Path | str]") -> tuple[Path, ...]:
+    """The same of one or several. Raises :class:`UsageError` where there are none."""
+    if not isinstance(data, Dataset | DatasetView | Path | str) and isinstance(data, Sequence):
+        if not data:
+            raise UsageError("data: must be a dataset or a list of them, and the list is empty")
+        return tuple(map(path_of, data))
+    return (path_of(data),)
 
 
 def source_of(dataset: Dataset) -> TrainingSource:

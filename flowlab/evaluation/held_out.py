@@ -40,21 +40,24 @@ def open_held_out(loaded: LoadedPolicy, data: Path | None = None) -> HeldOut:
     buffer = load_buffer(source, run, loaded.policy.needs.pictures)
     _check_fit(loaded.policy.spec, buffer, source.path)
     buffer = _select(buffer, _unseen(loaded, run, source, buffer))
-    return HeldOut(source.path, buffer, _cameras(source.path, buffer) if source.provenance.kind != "imported" else None)
+    return HeldOut(
+        source.path, buffer, _cameras(source.paths, buffer) if source.provenance.kind != "imported" else None
+    )
 
 
 def _open_source(loaded: LoadedPolicy, run: Path, data: Path | None) -> TrainingSource:
     """The dataset that is given, or the run's own, which must be what it was."""
     if data is not None:
         return open_training_source(data)
-    path = _read_plan(run).dataset
-    if not is_there(path):
-        raise DataError(f"{run}: its dataset is no longer at {path}; give where it is now with --data")
-    source = open_training_source(path)
+    paths = _read_plan(run).datasets
+    for path in paths:
+        if not is_there(path):
+            raise DataError(f"{run}: its dataset is no longer at {path}; give where it is now with --data")
+    source = open_training_source(*paths)
     if source.fingerprint != loaded.trained.fingerprint:
         raise DataError(
-            f"{run}: was trained on content {loaded.trained.fingerprint} of {path}, now {source.fingerprint}; restore "
-            "the dataset, or give another with --data"
+            f"{run}: was trained on content {loaded.trained.fingerprint} of {source.path}, now {source.fingerprint}; "
+            "restore the dataset, or give another with --data"
         )
     return source
 
@@ -113,7 +116,7 @@ def _known_scenes(trained: TrainedPolicy, run: Path, source: TrainingSource) -> 
     if source.provenance.is_simulated:
         scene_seeds = [(task, seed) for task in sorted(trained.scene_seeds) for seed in trained.scene_seeds[task]]
         return set([scene_seeds[k] for k in planned.train] if scene_seeds and planned is not None else scene_seeds)
-    if planned is not None and source.path.resolve() == planned.dataset:
+    if planned is not None and source.path.resolve() in planned.datasets:
         raise DataError(
             f"{source.path}: its content is no longer what {run} was trained on, and nothing tells which of its "
             "demonstrations were; give a dataset of others with --data"
@@ -128,8 +131,8 @@ def _select(buffer: ReplayBuffer, demos: Sequence[int]) -> ReplayBuffer:
     return replace(buffer, episodes=tuple(buffer.episodes[k] for k in demos), **mine)
 
 
-def _cameras(path: Path, buffer: ReplayBuffer) -> tuple[Camera | None, ...]:
+def _cameras(paths: Sequence[Path], buffer: ReplayBuffer) -> tuple[Camera | None, ...]:
     """The camera of every demonstration that has one for all of its rows: a simulated dataset's, or its recording's."""
-    shards = {(r.task, r.seed): r.shard for r in Dataset(path).refs}
-    cameras = {shard: Shard(path / shard).camera for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
+    shards = {(r.task, r.seed): path / r.shard for path in paths for r in Dataset(path).refs}
+    cameras = {shard: Shard(shard).camera for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
     return tuple(cameras[shards[d.task, d.seed]] for d in buffer.episodes)

@@ -62,9 +62,10 @@ def _check_begun(path: Path) -> None:
 def _check_plan(path: Path) -> None:
     """The plan, and the dataset that it is about."""
     planned, trained = read_run_config(path), read_trained(path)
-    if not is_there(planned.dataset):
-        raise DataError(f"{path / RUN}: dataset: {planned.dataset} is not there; restore it, or change where it is")
-    if (found := open_training_source(planned.dataset).fingerprint) != trained.fingerprint:
+    for place in planned.datasets:
+        if not is_there(place):
+            raise DataError(f"{path / RUN}: dataset: {place} is not there; restore it, or change where it is")
+    if (found := open_training_source(*planned.datasets).fingerprint) != trained.fingerprint:
         raise DataError(
             f"{planned.dataset}: its content is {found}, and {path} was trained on {trained.fingerprint}; restore it"
         )

@@ -39,8 +39,8 @@ _CHECKPOINT_NAME = re.compile(r"step-\d{8}\.safetensors")
 _LOG = logging.getLogger(__name__)
 _ADVICE = "delete it to use the checkpoint before it"
 _RESTORE = "restore it from a copy, or train anew into another --out"
-FREE = ("dataset",)
-"""What people may change in ``run.json``: where the dataset is, whose content is checked."""
+FREE = ("dataset", "more_datasets")
+"""What people may change in ``run.json``: where the datasets are, whose content is checked."""
 Model = TypeVar("Model", bound=Settings)
 
 
@@ -67,7 +67,7 @@ class TrainedPolicy(Settings):
         seeds = {t: tuple(e.seed for e in buffer.episodes if e.task == t) for t in buffer.tasks}
         return cls(
             policy=policy,
-            dataset=str(source.path),
+            dataset=", ".join(map(str, source.paths)),
             fingerprint=source.fingerprint,
             scene_seeds=seeds if about.is_simulated else {},
             scene=about.scene,

@@ -35,6 +35,8 @@ class RunConfig(Settings):
     """``run.json``: how a run goes; written when it begins, it stays the same until it ends."""
 
     dataset: Path
+    more_datasets: tuple[Path, ...] = ()
+    """Where there are several, the others."""
     steps: int
     train: tuple[int, ...]
     """Episodes trained on, by their position in the :class:`~flowlab.data.replay_buffer.ReplayBuffer`."""
@@ -48,6 +50,11 @@ class RunConfig(Settings):
     """Checkpoint that the first weights are from."""
     overfit: int | None = None
     """How many demonstrations are trained on and validated on, where they are the same."""
+
+    @property
+    def datasets(self) -> tuple[Path, ...]:
+        """All that it is trained on."""
+        return self.dataset, *self.more_datasets
 
 
 def read_run_config(folder: Path) -> RunConfig:

@@ -18,7 +18,7 @@ from flowlab.untrusted import is_there
 
 def resume_run(
     folder: Path,
-    data: Path | None = None,
+    data: Sequence[Path] = (),
     *,
     device: str | None = None,
     threads: int | None = None,
@@ -26,14 +26,15 @@ def resume_run(
     logs: Sequence[str] | None = None,
 ) -> Trainer:
     """A run that ended early, as it was after the last step that was saved; it computes on what it did, but for what
-    is given. ``data`` is where its dataset is, if it has moved.
+    is given. ``data`` is where its datasets are, if they have moved.
 
     Raises:
         DataError: The dataset is no longer what the run began with, or there is nothing to resume.
     """
     trained, began = read_trained(folder), read_run_config(folder)
     given = {
-        "dataset": None if data is None else data.resolve(),
+        "dataset": data[0].resolve() if data else None,
+        "more_datasets": tuple(path.resolve() for path in data[1:]) if data else None,
         "device": device,
         "threads": threads,
         "precision": precision,
@@ -43,11 +44,13 @@ def resume_run(
     with names_from_file(but=logs or ()):
         check_loggers(config.logs)
     processes = ProcessGroup(config.device, config.threads, config.precision)
-    if not is_there(config.dataset):
-        raise DataError(
-            f"{folder}: its dataset is no longer at {config.dataset}; restore it, or change 'dataset' in {folder / RUN}"
-        )
-    source = open_training_source(config.dataset)
+    for place in config.datasets:
+        if not is_there(place):
+            name = "dataset" if place == config.dataset else "more_datasets"
+            raise DataError(
+                f"{folder}: its dataset is no longer at {place}; restore it, or change '{name}' in {folder / RUN}"
+            )
+    source = open_training_source(*config.datasets)
     check_observer(trained, folder, source)
     if source.fingerprint != trained.fingerprint:
         raise DataError(

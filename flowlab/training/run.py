@@ -59,7 +59,7 @@ class ComputeSettings(Settings):
 
 
 def begin_run(
-    data: Path,
+    data: Path | Sequence[Path],
     out: Path,
     settings: TrainSettings,
     compute: ComputeSettings,
@@ -77,11 +77,12 @@ def begin_run(
     _check_same(out, settings, overfit, began_from)
     device = None if compute.device == "auto" else compute.device
     precision = None if compute.precision == "auto" else compute.precision
+    data = (data,) if isinstance(data, Path) else data
     return resume_run(out, data, device=device, threads=compute.threads, precision=precision, logs=compute.logs)
 
 
 def prepare_run(
-    data: Path,
+    data: Path | Sequence[Path],
     out: Path,
     settings: TrainSettings,
     compute: ComputeSettings,
@@ -92,7 +93,7 @@ def prepare_run(
     """A new run, ready to :func:`run`.
 
     Args:
-        data: The dataset, or a store in DP3's layout.
+        data: The dataset, or a store in DP3's layout; or several datasets.
         out: Folder of the run.
         settings: Of its policy.
         compute: What it computes on.
@@ -106,14 +107,15 @@ def prepare_run(
     check_loggers(compute.logs)
     processes = ProcessGroup(compute.device, compute.threads, compute.precision)
     processes.part(settings.batch.windows)
-    source = open_training_source(data)
+    source = open_training_source(*((data,) if isinstance(data, Path) else data))
     buffer = load_buffer(source, out, settings.needs.pictures)
     train, held_out = split_episodes(buffer.episodes, settings.data)
     if overfit is not None:
         train = held_out = list(range(min(overfit, len(buffer.episodes))))
     policy = _new_policy(source, buffer, settings, began_from)
     planned = RunConfig(
-        dataset=data.resolve(),
+        dataset=source.path.resolve(),
+        more_datasets=tuple(path.resolve() for path in source.more),
         steps=_epochs_to_steps(buffer, train, settings),
         train=tuple(train),
         held_out=tuple(held_out),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.arguments import check_count, check_minutes, check_names, check_optional_count, check_path, check_settings
-from flowlab.data.source import path_of
+from flowlab.data.source import paths_of
 from flowlab.policies.checkpoint import writing_run
 from flowlab.policies.profiles import load_settings
 from flowlab.storage.dataset import Dataset
@@ -84,7 +84,7 @@ class Watch:
 
 
 def train(
-    data: Dataset | Path | str,
+    data: Dataset | Path | str | Sequence[Dataset | Path | str],
     out: Path | str,
     *,
     policy: str = "fdp",
@@ -105,7 +105,8 @@ def train(
     Under ``torchrun`` every process calls this, and they share each batch.
 
     Args:
-        data: A dataset, opened or its path, or a store in DP3's layout.
+        data: A dataset, opened or its path, or a store in DP3's layout; or several datasets that say the same of their
+            frame, their camera, and what their numbers mean.
         out: Folder of the run. Where the same call began it earlier, it goes on as if it had never stopped.
         policy: ``fdp``, ``dp3``, ``mba``, what an installed package offers, or ``module:Class``, whose module may lie
             in the current folder.
@@ -139,7 +140,7 @@ def train(
     check_loggers(tuple(logs), here)
     compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
     began = None if began_from is None else check_path(began_from, "began_from")
-    trainer = begin_run(path_of(data), check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
+    trainer = begin_run(paths_of(data), check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
     return _run(trainer, watch)
 
 
