@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from flowlab.actions.kernel import MOST_ROWS, KernelRegression
+from flowlab.actions.linear import LinearPart
 from flowlab.actions.robot import GripperPath, RobotLayout
 from flowlab.actions.sight import SeenRobot
 
@@ -95,13 +96,19 @@ class InverseModel:
     """A fitted inverse model: actions by motion, relative to the gripper."""
 
     layout: RobotLayout
+    linear: LinearPart
     regression: KernelRegression
+    """Of what the linear part leaves."""
     unit: Float[np.ndarray, "A"]
     """How much each number varies."""
 
     def infer(self, motion: Motion, path: GripperPath, like: Float[np.ndarray, "A"]) -> Float[np.ndarray, "T A"]:
         """The actions of an episode, in the dataset's units; ``like`` is one of the demonstrations."""
-        return _absolute(self.layout, self.regression.predict(motion.features()), path, like)
+        return _absolute(self.layout, self.relative(motion), path, like)
+
+    def relative(self, motion: Motion) -> Float[np.ndarray, "T A"]:
+        """The same relative to the gripper; of a rotation three numbers are used."""
+        return self.linear.predict(motion) + self.regression.predict(motion.features())
 
     def novelty(self, motion: Motion) -> Float[np.ndarray, "T"]:
         """How unlike the demonstrations a motion is, from 0 to 1."""
@@ -114,6 +121,9 @@ def fit_inverse(
     path: GripperPath,
     action: Float[np.ndarray, "F A"],
     rng: np.random.Generator,
+    *,
+    sure: int,
+    ridge: float,
 ) -> InverseModel:
     """Fit it on demonstrations; where all that has a direction is known, in scenes turned about z and mirrored, too.
 
@@ -123,21 +133,26 @@ def fit_inverse(
         path: The gripper's pose in every frame.
         action: The action of every frame.
         rng: Draws turns.
+        sure: So many of the frames, the first ones, are as they were recorded; the linear part is fitted to these.
+        ridge: Of what the linear part leaves; a large one leaves it alone.
     """
     relative = _relative(layout, action.astype(float), path)
+    linear = LinearPart.fit(layout, motion.rows(np.arange(sure)), relative[:sure])
+    left = relative - linear.predict(motion)
     frames = len(motion.way)
     copies = max(1, MOST_ROWS // frames) if layout.turns else 1
     rows = np.tile(np.arange(frames), min(copies, 16))[:MOST_ROWS]
     if frames > MOST_ROWS:
         rows = np.sort(rng.choice(frames, MOST_ROWS, replace=False))
-    motion, relative = motion.rows(rows), relative[rows].copy()
+    motion, left = motion.rows(rows), left[rows]
     if layout.turns:
         M = _turns(len(rows), rng, mirrors=path.R is None)
         M[: min(frames, len(rows))] = np.eye(3)  # each as it was, too
         motion = motion.turned(M)
-        relative[:, layout.vector] = np.einsum("tij,tj->ti", M, relative[:, layout.vector])
+        left[:, layout.vector] = np.einsum("tij,tj->ti", M, left[:, layout.vector])
     unit = np.maximum(action.std(0).astype(float), 1e-6)
-    return InverseModel(layout, KernelRegression.fit(motion.features(), relative, ridge=0.003, sharpness=1.0), unit)
+    regression = KernelRegression.fit(motion.features(), left, ridge=ridge, sharpness=1.0)
+    return InverseModel(layout, linear, regression, unit)
 
 
 def disturbed(
@@ -147,7 +162,7 @@ def disturbed(
     path, jitter = seen.path.path, seen.path.jitter_m[:, None]
 
     def actions(position: np.ndarray) -> np.ndarray:
-        return model.regression.predict(motion_of(layout, path.moved_to(position), seen.rest, unit).features())
+        return model.relative(motion_of(layout, path.moved_to(position), seen.rest, unit))
 
     plain = actions(path.position)
     if not jitter.any():

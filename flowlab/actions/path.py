@@ -118,7 +118,7 @@ def _of_clouds(found: GripperPath) -> RefinedPath:
     rough = np.linalg.norm(found.position - position, axis=1)
     spread = np.sqrt(smooth(rough[:, None] ** 2)[:, 0] + np.median(rough) ** 2) + _FLOOR_M
     R = None if found.R is None else Rotation.from_matrix(smooth(found.R.reshape(-1, 9)).reshape(-1, 3, 3)).as_matrix()
-    return RefinedPath(GripperPath(position, R), spread, spread / 2, 0)
+    return RefinedPath(GripperPath(position, R), spread, spread, 0)
 
 
 def smooth(values: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:

@@ -103,11 +103,11 @@ def path_of(data: Dataset | Path | str) -> Path:
 
 def paths_of(data: "Dataset | Path | str | Sequence[Dataset | Path | str]") -> tuple[Path, ...]:
     """The same of one or several. Raises :class:`UsageError` where there are none."""
-    if not isinstance(data, Dataset | DatasetView | Path | str) and isinstance(data, Sequence):
+    if isinstance(data, list | tuple):
         if not data:
             raise UsageError("data: must be a dataset or a list of them, and the list is empty")
         return tuple(map(path_of, data))
-    return (path_of(data),)
+    return (path_of(data),)  # type: ignore[arg-type] # no other sequence is one
 
 
 def source_of(dataset: Dataset) -> TrainingSource:
