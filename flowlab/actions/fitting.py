@@ -58,7 +58,7 @@ def _frame_problem(films: Dataset, labeled: Dataset, *, with_state: bool) -> str
     compared = ["kind", "world_frame", "camera", "observer", *(["state"] if with_state else [])]
     found = [d.provenance.model_dump(mode="json") for d in (films, labeled)]
     old, new = ({k: values[k] for k in compared} for values in found)
-    lines = [*differences(new, old, owners=("it", "the films"))]
+    lines = [*differences(new, old, owners=("it", "the dataset of films"))]
     if not lines:
         return ""
     more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""

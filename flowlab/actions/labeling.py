@@ -24,10 +24,11 @@ from flowlab.pipeline.units import JobShard, WorkUnit
 from flowlab.pipeline.worker import keep_unit
 from flowlab.provenance import ChannelError, Inferred
 from flowlab.records import Episode
-from flowlab.storage.dataset import Dataset
-from flowlab.storage.manifest import Manifest
+from flowlab.storage.dataset import Dataset, check_continues
+from flowlab.storage.manifest import MANIFEST, Manifest
 from flowlab.storage.receipts import Receipt, Reject, StageTally
 from flowlab.storage.shard import write_shard
+from flowlab.storage.validation import lost_shards
 
 STAGE = "label-actions"
 _NO_ARRAYS = ("state", "action")
@@ -91,6 +92,9 @@ def label_actions(
     if problem := fitting_problem(source, target):
         raise DataError(problem)
     what = tuple(n for n in _NO_ARRAYS if n == "action" or not (source.row_format and source.row_format.state))
+    check_continues(place, _manifest(source, target, chosen, {}, what))
+    if not repair and (done := _finished(place, _units(source))):
+        return done
     labelers = learn_labelers(source, target, chosen, find="state" in what)
     return fill_by(
         lambda manifest: partial(_label_unit, labelers, chosen, source.path, manifest.settings_digest, place),
@@ -177,6 +181,14 @@ def _manifest(
         first_seed=films.manifest.first_seed,
         requested=dict(Counter(ref.task for ref in films.refs)),
     )
+
+
+def _finished(folder: Path, units: Sequence[WorkUnit]) -> Dataset | None:
+    """The dataset of a folder, if there is nothing left to do: then nothing need be learned."""
+    dataset = Dataset(folder) if (folder / MANIFEST).is_file() else None
+    if dataset is None or {u.name for u in units} - {r.unit for r in dataset.receipts}:
+        return None
+    return None if any(lost_shards(folder, r) for r in dataset.receipts) else dataset
 
 
 _METHOD = "gripper's shape laid onto clouds, its path by the tracks on it, inverse model on the path"

@@ -58,7 +58,7 @@ def _with_one(x: np.ndarray) -> np.ndarray:
 
 
 def _ridge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Weights of columns, each measured in its own size: the steps around an action count as much as those far ahead."""
+    """Weights of columns, each measured in its own size: steps nearby count as much as those far ahead."""
     size = np.sqrt((x**2).mean(0)) + 1e-9
     x = x / size
     weights = np.linalg.solve(x.T @ x + _RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y)

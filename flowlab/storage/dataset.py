@@ -226,6 +226,12 @@ def begin(folder: Path, manifest: Manifest) -> Manifest:
     return manifest
 
 
+def check_continues(folder: Path, manifest: Manifest) -> None:
+    """Refuse a folder that holds a dataset made with other settings. Raises :class:`DataError` with the difference."""
+    if (folder / MANIFEST).exists():
+        _check_settings(folder, Manifest.read(folder), manifest)
+
+
 def _joined(folder: Path, manifest: Manifest) -> Manifest:
     """The manifest of a folder that may have one, now asking for what ``manifest`` asks for too."""
     joined, known = manifest, manifest.recordings[:0]

@@ -42,10 +42,13 @@ def turning_demo(seed: int, *, form: str = "wxyz", tracks_on_gripper: bool = Tru
     position = np.array([0, 0.5, 0.3]) + wander(3, 0.12)
     R = Rotation.from_rotvec(wander(3, 0.5))
     opening = 0.03 + wander(1, 0.02)[:, 0]
-    body = np.concatenate([_box(rng, (0.05, 0.03, 0.02), 220), _box(rng, (0.012, 0.03, 0.03), 60) + [0.03, 0.0, 0.05]])
-    finger = _box(rng, (0.008, 0.01, 0.03), 60) + [0, 0, -0.05]
+    body = np.concatenate(
+        [_box(rng, (0.05, 0.03, 0.02), 220), _box(rng, (0.012, 0.03, 0.03), 60) + np.array([0.03, 0, 0.05])]
+    )
+    finger = _box(rng, (0.008, 0.01, 0.03), 60) + np.array([0, 0, -0.05])
     table = np.append(rng.uniform([-0.3, 0.2], [0.3, 0.8], (300, 2)), np.zeros((300, 1)), 1)
-    local = [np.concatenate([body, finger + [o / 2 + 0.008, 0, 0], finger - [o / 2 + 0.008, 0, 0]]) for o in opening]
+    apart = np.stack([opening / 2 + 0.008, 0 * opening, 0 * opening], 1)
+    local = [np.concatenate([body, finger + a, finger - a]) for a in apart]
     moved = np.stack([R[t].apply(local[t]) + position[t] for t in range(STEPS)])
     scene = np.concatenate([moved, np.broadcast_to(table, (STEPS, *table.shape))], 1).astype(np.float32)
     shown = np.stack([scene[t, rng.permutation(scene.shape[1])[:400]] for t in range(STEPS)])
