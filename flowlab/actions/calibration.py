@@ -35,7 +35,7 @@ class InferredRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class ErrorCalibration:
     """By how much spreads are to be multiplied, so that 68 % of errors lie below them."""
 
     state: Float[np.ndarray, "S"]
@@ -52,7 +52,7 @@ class Calibration:
         return np.maximum(rows.state_spread * self.state, _LEAST_M), _sized(rows, self.size) * self.action
 
 
-def calibrate(truth: Sequence[Episode], guessed: Sequence[InferredRows]) -> Calibration:
+def calibrate(truth: Sequence[Episode], guessed: Sequence[InferredRows]) -> ErrorCalibration:
     """Compare what was inferred of demonstrations that were left out with what is known of them.
 
     Args:
@@ -64,7 +64,7 @@ def calibrate(truth: Sequence[Episode], guessed: Sequence[InferredRows]) -> Cali
     state, state_errors = _calibrated("state", truth, [g.state for g in guessed], [g.state_spread for g in guessed])
     action, action_errors = _calibrated("action", truth, [g.action for g in guessed], scaled)
     few = (len(truth) + 1) / len(truth)  # of few demonstrations, the worst was hardly seen
-    return Calibration(
+    return ErrorCalibration(
         state * few, action, _size(truth, guessed, every), (*state_errors, *action_errors), min(g.fit for g in guessed)
     )
 

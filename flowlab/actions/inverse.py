@@ -24,7 +24,7 @@ _DRAWS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class GripperMotion:
     """What an action is inferred from, row by row."""
 
     way: Float[np.ndarray, "T k 3"]
@@ -35,9 +35,9 @@ class Motion:
     grip: Float[np.ndarray, "T g"]
     """What else the state tells around every instant, and how much of the demonstration is before and after it."""
 
-    def rows(self, chosen: np.ndarray) -> "Motion":
+    def rows(self, chosen: np.ndarray) -> "GripperMotion":
         """Some of the instants."""
-        return Motion(self.way[chosen], self.turn[chosen], self.grip[chosen])
+        return GripperMotion(self.way[chosen], self.turn[chosen], self.grip[chosen])
 
     def features(self) -> Float[np.ndarray, "T d"]:
         """All of it in one row."""
@@ -51,19 +51,19 @@ class Motion:
         return np.concatenate([far / _UNIT_M, up / _UNIT_M, self.grip], 1)
 
     @classmethod
-    def join(cls, motions: "Sequence[Motion]") -> "Motion":
+    def join(cls, motions: "Sequence[GripperMotion]") -> "GripperMotion":
         """Some one behind the other."""
         way, turn, grip = (np.concatenate([getattr(m, n) for m in motions]) for n in ("way", "turn", "grip"))
         return cls(way, turn, grip)
 
-    def turned(self, M: Float[np.ndarray, "T 3 3"]) -> "Motion":
+    def turned(self, M: Float[np.ndarray, "T 3 3"]) -> "GripperMotion":
         """The same in a scene that was turned or mirrored."""
-        return Motion(np.einsum("tij,tkj->tki", M, self.way), self.turn, self.grip)
+        return GripperMotion(np.einsum("tij,tkj->tki", M, self.way), self.turn, self.grip)
 
 
 def motion_of(
     layout: RobotLayout, path: GripperPath, rest: Float[np.ndarray, "T r"], unit: Float[np.ndarray, "r"]
-) -> Motion:
+) -> GripperMotion:
     """What the actions of an episode are inferred from.
 
     Args:
@@ -88,7 +88,7 @@ def motion_of(
     grip = np.concatenate([np.stack(apart, 1) if apart else np.zeros((frames, 0)), others], 1)
     left = np.minimum(frames - 1 - np.arange(frames), _AHEAD) / _AHEAD
     gone = np.minimum(np.arange(frames), _BACK) / _BACK
-    return Motion(way, turn, np.concatenate([grip[around].reshape(frames, -1), left[:, None], gone[:, None]], 1))
+    return GripperMotion(way, turn, np.concatenate([grip[around].reshape(frames, -1), left[:, None], gone[:, None]], 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,22 +102,22 @@ class InverseModel:
     unit: Float[np.ndarray, "A"]
     """How much each number varies."""
 
-    def infer(self, motion: Motion, path: GripperPath, like: Float[np.ndarray, "A"]) -> Float[np.ndarray, "T A"]:
+    def infer(self, motion: GripperMotion, path: GripperPath, like: Float[np.ndarray, "A"]) -> Float[np.ndarray, "T A"]:
         """The actions of an episode, in the dataset's units; ``like`` is one of the demonstrations."""
         return _absolute(self.layout, self.relative(motion), path, like)
 
-    def relative(self, motion: Motion) -> Float[np.ndarray, "T A"]:
+    def relative(self, motion: GripperMotion) -> Float[np.ndarray, "T A"]:
         """The same relative to the gripper; of a rotation three numbers are used."""
         return self.linear.predict(motion) + self.regression.predict(motion.features())
 
-    def novelty(self, motion: Motion) -> Float[np.ndarray, "T"]:
+    def novelty(self, motion: GripperMotion) -> Float[np.ndarray, "T"]:
         """How unlike the demonstrations a motion is, from 0 to 1."""
         return self.regression.novelty(motion.features())
 
 
 def fit_inverse(
     layout: RobotLayout,
-    motion: Motion,
+    motion: GripperMotion,
     path: GripperPath,
     action: Float[np.ndarray, "F A"],
     rng: np.random.Generator,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from flowlab.actions.calibration import Calibration, InferredRows, calibrate
-from flowlab.actions.inverse import InverseModel, Motion, disturbed, fit_inverse, motion_of
+from flowlab.actions.calibration import ErrorCalibration, InferredRows, calibrate
+from flowlab.actions.inverse import GripperMotion, InverseModel, disturbed, fit_inverse, motion_of
 from flowlab.actions.robot import GripperPath, RobotLayout
 from flowlab.actions.sight import RobotSight, SeenRobot, known_robot, learn_sight, see_robot
 from flowlab.records import Episode
@@ -32,7 +32,7 @@ class ActionLabeler:
     rest_unit: Float[np.ndarray, "r"]
     like: tuple[np.ndarray, np.ndarray]
     """A state and an action of the demonstrations."""
-    calibration: Calibration
+    calibration: ErrorCalibration
 
     def infer(self, episode: Episode) -> InferredRows:
         """State and actions of a film."""
@@ -50,7 +50,7 @@ def _error(guessed: Sequence[InferredRows], truth: Sequence[Episode]) -> float:
 class _Sample:
     """A labeled demonstration as it is known, or as it was seen by what the others taught."""
 
-    motion: Motion
+    motion: GripperMotion
     path: GripperPath
     action: np.ndarray
 
@@ -103,7 +103,7 @@ def _fit(
     layout: RobotLayout, known: Sequence[_Sample], again: Sequence[_Sample], way: tuple[float, bool], seed: int
 ) -> InverseModel:
     samples = [*known, *again]
-    motion = Motion.join([s.motion for s in samples])
+    motion = GripperMotion.join([s.motion for s in samples])
     path = GripperPath.join([s.path for s in samples])
     action = np.concatenate([s.action for s in samples])
     ridge, linear = way

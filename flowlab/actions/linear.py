@@ -9,7 +9,7 @@ from jaxtyping import Float
 from flowlab.actions.robot import RobotLayout
 
 if TYPE_CHECKING:
-    from flowlab.actions.inverse import Motion
+    from flowlab.actions.inverse import GripperMotion
 
 _RIDGE = 1e-4
 """Of the mean square of a column."""
@@ -26,7 +26,7 @@ class LinearPart:
     """For all numbers that have no direction; the last row is what is added always."""
 
     @classmethod
-    def fit(cls, layout: RobotLayout, motion: "Motion", action: Float[np.ndarray, "F A"]) -> "LinearPart":
+    def fit(cls, layout: RobotLayout, motion: "GripperMotion", action: Float[np.ndarray, "F A"]) -> "LinearPart":
         """Fit it to actions relative to the gripper; where there are none, it is nothing."""
         way, turn = np.zeros(motion.way.shape[1]), np.zeros(motion.turn.shape[1])
         if not len(action):
@@ -37,7 +37,7 @@ class LinearPart:
             turn = _ridge(_columns(motion.turn), action[:, layout.target_rotation.index[:3]].reshape(-1))
         return cls(layout, way, turn, _ridge(_with_one(motion.grip), action[:, layout.other_action]))
 
-    def predict(self, motion: "Motion") -> Float[np.ndarray, "T A"]:
+    def predict(self, motion: "GripperMotion") -> Float[np.ndarray, "T A"]:
         """Actions relative to the gripper, as far as they are such a sum."""
         action = np.zeros((len(motion.way), self.layout.action_width))
         if self.layout.vector is not None:

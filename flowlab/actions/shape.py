@@ -13,11 +13,13 @@ from flowlab.geometry.sampling import farthest_points
 
 _REACH_M = 0.15
 """What is farther from the gripper's position is no part of its shape."""
-_CELL_M = 0.006
+_CELL_M = 0.012
 """Cells in which its surface is gathered."""
-_SEEN_SHARE = 0.15
-"""A cell is the gripper's where it is filled in so many of the frames, compared with the fullest ones: the rest of the
-scene moves past a gripper that moves."""
+_SEEN_SHARE = 0.4
+"""A cell is the gripper's where it is filled at so many of the places where the gripper was, compared with the fullest
+cells: the rest of the scene moves past a gripper that moves, and what it holds it does not hold everywhere."""
+_PLACES, _APART_M = 60, 0.015
+"""Places that are looked at: so many, at least so far apart, for where a demonstration dwells the scene stands still."""
 _NEIGHBORS = 32
 """Points that a normal is fitted to."""
 _NEAR_M = (0.03, 0.02, 0.012, 0.008, 0.006, 0.006, 0.006, 0.006)
@@ -65,7 +67,8 @@ def gather_shape(clouds: Sequence[Float[np.ndarray, "N 3"]], path: GripperPath) 
     Returns:
         The shape; None where nothing recurs, as where the clouds do not show the gripper.
     """
-    local = [path.to_gripper(np.asarray(cloud, float), k) for k, cloud in enumerate(clouds)]
+    places = _places(path)
+    local = [path.to_gripper(np.asarray(clouds[k], float), k) for k in places]
     local = [x[np.linalg.norm(x, axis=1) < _REACH_M] for x in local]
     filled = [np.unique(_cells(x), axis=0) for x in local]
     cell, count = np.unique(np.concatenate(filled), axis=0, return_counts=True)
@@ -82,8 +85,18 @@ def gather_shape(clouds: Sequence[Float[np.ndarray, "N 3"]], path: GripperPath) 
     normal = np.linalg.eigh(np.swapaxes(near, 1, 2) @ near)[1][:, :, 0]
     chosen = farthest_points(path.position.astype(np.float32), min(_STARTS, len(path)))
     shape = GripperShape(points, normal, tree, path.rows(chosen), len(cell))
-    used = [_lay(shape, cloud, path.rows(np.array([k])))[1] for k, cloud in enumerate(clouds)]
+    used = [_lay(shape, clouds[k], path.rows(np.array([k])))[1] for k in places]
     return GripperShape(points, normal, tree, shape.starts, len(cell), max(float(np.median(used)), 1.0))
+
+
+def _places(path: GripperPath) -> list[int]:
+    """Frames in which the gripper was at different places."""
+    order = farthest_points(path.position.astype(np.float32), min(_PLACES, len(path)))
+    chosen: list[int] = []
+    for k in order.tolist():
+        if all(np.linalg.norm(path.position[k] - path.position[j]) > _APART_M for j in chosen):
+            chosen.append(k)
+    return chosen
 
 
 def _cells(xyz: np.ndarray) -> np.ndarray:
