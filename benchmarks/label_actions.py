@@ -1,7 +1,8 @@
 """How well state and actions of films are inferred, against MuJoCo's own: ``python benchmarks/label_actions.py``.
 
-For every task some demonstrations teach and others, whose state and actions are withheld, are labeled: errors by number,
-motion of the gripper, and the share of errors within their stated size. By default two tasks, 3 demonstrations and 4 films.
+For every task some demonstrations teach and others, whose state and actions are withheld, are labeled: errors by
+number, motion of the gripper, and the share of errors within their stated size. By default two tasks, 3 demonstrations
+and 4 films.
 """
 
 import argparse

@@ -1,10 +1,11 @@
 """The gripper's shape, gathered in its own frame from demonstrations, and found again in other clouds."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -15,11 +16,15 @@ _REACH_M = 0.15
 """What is farther from the gripper's position is no part of its shape."""
 _CELL_M = 0.012
 """Cells in which its surface is gathered."""
-_SEEN_SHARE = 0.4
+_SEEN_SHARE = 0.35
 """A cell is the gripper's where it is filled at so many of the places where the gripper was, compared with the fullest
-cells: the rest of the scene moves past a gripper that moves, and what it holds it does not hold everywhere."""
-_PLACES, _APART_M = 60, 0.015
-"""Places that are looked at: so many, at least so far apart, for where a demonstration dwells the scene stands still."""
+cells, in every third of the demonstrations: the rest of the scene moves past a gripper that moves, and what it holds it
+does not hold from beginning to end."""
+_PHASES, _FEWEST = 3, 4
+"""A third with fewer places tells nothing."""
+_PLACES, _APART_M = 40, 0.015
+"""Places of each third that are looked at: so many, at least so far apart, for where a demonstration dwells the scene
+stands still."""
 _NEIGHBORS = 32
 """Points that a normal is fitted to."""
 _NEAR_M = (0.03, 0.02, 0.012, 0.008, 0.006, 0.006, 0.006, 0.006)
@@ -57,24 +62,28 @@ class FoundGripper:
     """1 where as much fits as is usual; below 0.6 it is not it."""
 
 
-def gather_shape(clouds: Sequence[Float[np.ndarray, "N 3"]], path: GripperPath) -> GripperShape | None:
+def gather_shape(
+    clouds: Sequence[Float[np.ndarray, "N 3"]], path: GripperPath, progress: Float[np.ndarray, "F"]
+) -> GripperShape | None:
     """The shape that recurs around the gripper in many frames.
 
     Args:
         clouds: One of every frame [m].
         path: The gripper's pose in each.
+        progress: How far each is through its demonstration, from 0 to 1.
 
     Returns:
         The shape; None where nothing recurs, as where the clouds do not show the gripper.
     """
-    places = _places(path)
+    phase = np.minimum((progress * _PHASES).astype(int), _PHASES - 1)
+    phases = [_places(path, np.flatnonzero(phase == n)) for n in range(_PHASES)]
+    places = [k for frames in phases for k in frames]
     local = [path.to_gripper(np.asarray(clouds[k], float), k) for k in places]
     local = [x[np.linalg.norm(x, axis=1) < _REACH_M] for x in local]
-    filled = [np.unique(_cells(x), axis=0) for x in local]
-    cell, count = np.unique(np.concatenate(filled), axis=0, return_counts=True)
-    if not len(count):
+    filled = dict(zip(places, ({tuple(c) for c in _cells(x).tolist()} for x in local), strict=True))
+    often = _common([_often([filled[k] for k in frames]) for frames in phases if len(frames) >= _FEWEST])
+    if not often:
         return None
-    often = {tuple(c) for c in cell[count >= max(2, _SEEN_SHARE * np.quantile(count, 0.98))].tolist()}
     points = np.concatenate(local)
     points = points[[tuple(k) in often for k in _cells(points).tolist()]]
     if len(points) < _NEIGHBORS:
@@ -84,16 +93,31 @@ def gather_shape(clouds: Sequence[Float[np.ndarray, "N 3"]], path: GripperPath) 
     near -= near.mean(1, keepdims=True)
     normal = np.linalg.eigh(np.swapaxes(near, 1, 2) @ near)[1][:, :, 0]
     chosen = farthest_points(path.position.astype(np.float32), min(_STARTS, len(path)))
-    shape = GripperShape(points, normal, tree, path.rows(chosen), len(cell))
+    shape = GripperShape(points, normal, tree, path.rows(chosen), len(often))
     used = [_lay(shape, clouds[k], path.rows(np.array([k])))[1] for k in places]
-    return GripperShape(points, normal, tree, shape.starts, len(cell), max(float(np.median(used)), 1.0))
+    return GripperShape(points, normal, tree, shape.starts, len(often), max(float(np.median(used)), 1.0))
 
 
-def _places(path: GripperPath) -> list[int]:
-    """Frames in which the gripper was at different places."""
-    order = farthest_points(path.position.astype(np.float32), min(_PLACES, len(path)))
+def _often(filled: Sequence[set[tuple[int, ...]]]) -> set[tuple[int, ...]]:
+    """The cells that are filled nearly as often as the fullest ones."""
+    count = Counter(cell for cells in filled for cell in cells)
+    if not count:
+        return set()
+    least = max(2.0, _SEEN_SHARE * float(np.quantile(list(count.values()), 0.98)))
+    return {cell for cell, n in count.items() if n >= least}
+
+
+def _common(parts: Sequence[set[tuple[int, ...]]]) -> set[tuple[int, ...]]:
+    return set.intersection(*parts) if parts else set()
+
+
+def _places(path: GripperPath, frames: Int[np.ndarray, "n"]) -> list[int]:
+    """Those of some frames in which the gripper was at different places."""
+    if not len(frames):
+        return []
+    order = farthest_points(path.position[frames].astype(np.float32), min(_PLACES, len(frames)))
     chosen: list[int] = []
-    for k in order.tolist():
+    for k in frames[order].tolist():
         if all(np.linalg.norm(path.position[k] - path.position[j]) > _APART_M for j in chosen):
             chosen.append(k)
     return chosen

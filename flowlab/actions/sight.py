@@ -54,7 +54,7 @@ def learn_sight(demos: Sequence[Episode], layout: RobotLayout, seed: int = 0) ->
     """
     state, clouds = np.concatenate([e.state for e in demos]), clouds_of(demos)
     path = layout.path(state)
-    shape = gather_shape(clouds, path)
+    shape = gather_shape(clouds, path, progress_of(demos))
     if shape is None:
         raise DataError(
             "the clouds of the labeled demonstrations show nothing where their state says that the gripper is, so it "
@@ -83,6 +83,11 @@ def clouds_of(demos: Sequence[Episode]) -> list[Float[np.ndarray, "N 3"]]:
     return [c[: max(int(n), 1)] for e in demos for c, n in zip(e.point_cloud, e.point_count, strict=True)]
 
 
+def progress_of(demos: Sequence[Episode]) -> Float[np.ndarray, "F"]:
+    """How far every frame is through its demonstration, from 0 to 1."""
+    return np.concatenate([np.linspace(0, 1, len(e)) for e in demos])
+
+
 def sharpest(demos: Sequence[Episode], layout: RobotLayout) -> RobotLayout:
     """The layout with its rotations in the form in which the gripper's shape is sharpest: in which order a quaternion
     has its numbers is rarely said."""
@@ -95,6 +100,6 @@ def sharpest(demos: Sequence[Episode], layout: RobotLayout) -> RobotLayout:
         if layout.target_rotation is not None and len(layout.target_rotation.index) == len(layout.rotation.index):
             changes["target_rotation"] = layout.target_rotation.model_copy(update={"form": form})
         tried = layout.model_copy(update=changes)
-        shape = gather_shape(clouds[::4], tried.path(state[::4]))
+        shape = gather_shape(clouds[::2], tried.path(state[::2]), progress_of(demos)[::2])
         found += [(shape.cells, tried)] if shape is not None else []
     return min(found, key=lambda x: x[0])[1] if found else layout
