@@ -16,8 +16,8 @@ EVIDENCE = (
     "1", "surroundings", "body", "other motions around", "still", "spread", "apart", "apart, expected", "undecided",
 )  # fmt: skip
 """What doubt is told from, see :func:`evidence`."""
-WEIGHTS = (-6.95, 4.39, 0.92, 3.34, 1.94, 0.12, 0.40, -0.02, 0.45)
-"""Log-odds per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py``."""
+WEIGHTS = (-7.38, 4.65, 1.93, 3.50, 2.18, 0.15, 0.40, -0.02, 0.30)
+"""Log-odds per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py`` as of commit ee6b5f3."""
 FAR_M = 0.02
 """An error beyond this is far."""
 _CELLS, _NEAR = 3000, 12
