@@ -2,12 +2,13 @@
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do command -v $$p && break; done)
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+LONG := OMP_NUM_THREADS=1 nice -n 10 $(BIN)/flowlab bench --workers 1 --device cpu
 unexport PYTHONDONTWRITEBYTECODE # images set it; each of the hundreds of processes would compile all that it imports
 
-.PHONY: demo test test-all campaigns lint format house docs wheel benchmark clean help
+.PHONY: demo test test-all campaigns lint format house docs wheel benchmark table1 ablations clean help
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 demo: .venv/run .venv/opengl ## a policy from nothing in minutes, and labels from pictures alone: demo/index.html
 	rm -rf demo
@@ -51,6 +52,12 @@ wheel: .venv/build ## build the wheel and try it in an environment of its own
 
 benchmark: .venv/benchmark ## ours against what a user would do otherwise
 	$(BIN)/python benchmarks/extract.py
+
+table1: .venv/run ## the paper's Table I on one core, from where docs/results/table1 is; says what is left
+	$(LONG) --recipe table1 --out docs/results/table1
+
+ablations: .venv/run ## the paper's Tables II and III and its learning curves, likewise
+	$(LONG) --recipe ablations --out docs/results/ablations
 
 clean: ## remove environments and everything made by the targets above
 	rm -rf .venv .venv-wheel demo dist site

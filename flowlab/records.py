@@ -210,6 +210,20 @@ class PositionSource(IntEnum):
     """Neither: interpolated between instants at which it was known, or held at the last."""
 
 
+class Sight(IntEnum):
+    """Whether the sensor sees a tracked point, at one instant, and why not."""
+
+    SEEN = 0
+    COVERED = 1
+    """Something nearer is read at its place."""
+    OUT_OF_VIEW = 2
+    """It is beside the picture, or behind the camera."""
+    NO_READING = 3
+    """The sensor gave no depth at its place, or beside it: the picture may show the point or not."""
+    SEEN_THROUGH = 4
+    """What is behind it is read at its place: wherever the point is, it is not there, or the tracker lost it."""
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class FlowPrediction(Record):
     """Where a policy expected the query points of an episode to go, plan by plan."""
@@ -236,6 +250,8 @@ class Quality(Record):
     """See :class:`Tracks2D`."""
     residual: Float32[np.ndarray, "T M"]
     """See :class:`Tracks2D`."""
+    sight: UInt8[np.ndarray, "T M"] | None = None
+    """The :class:`Sight` of every position; None in datasets made before this was told."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

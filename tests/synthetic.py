@@ -14,7 +14,7 @@ from flowlab.checksums import sha256_of
 from flowlab.cli import main
 from flowlab.geometry.camera import Camera
 from flowlab.provenance import Provenance
-from flowlab.records import Entity, Episode, PositionSource, Quality, Queries, Role, Tracks3D
+from flowlab.records import Entity, Episode, PositionSource, Quality, Queries, Role, Sight, Tracks3D
 from flowlab.storage import stats
 from flowlab.storage.dataset import Dataset, begin, summarize
 from flowlab.storage.manifest import MANIFEST, Manifest
@@ -220,6 +220,7 @@ def with_quality(episode: Episode, seed: int = 0) -> Episode:
         forward_backward=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 2, shape)).astype(np.float32),
         disagreement=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 2, shape)).astype(np.float32),
         residual=np.where(rng.random(shape) < 0.2, -1, rng.uniform(0, 1, shape)).astype(np.float32),
+        sight=np.where(visible, Sight.SEEN, rng.choice([Sight.COVERED, Sight.OUT_OF_VIEW], shape)).astype(np.uint8),
     )
     return replace(episode, tracks=replace(episode.tracks, quality=quality))
 

@@ -1,6 +1,7 @@
 """Run a whole experiment: datasets, policies, their evaluations; unit by unit, each done once."""
 
 import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -9,7 +10,7 @@ from typing import Any
 
 from flowlab.benchmark.recipe import ExperimentRecipe, curve_trials, final_trials
 from flowlab.benchmark.results import read_result, unit_path, write_result
-from flowlab.benchmark.units import ExperimentUnit, plan_units, sampling_of
+from flowlab.benchmark.units import ExperimentUnit, plan_units, sampling_of, share_of_units
 from flowlab.data.training_settings import TrainSettings
 from flowlab.engines.base import StartEngine, engine_by_name
 from flowlab.errors import DataError, UnfinishedError
@@ -18,6 +19,7 @@ from flowlab.evaluation.evaluate import evaluate_here
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
+from flowlab.pipeline.units import JobShard
 from flowlab.policies.checkpoint import newest_checkpoint, read_trained, step_of
 from flowlab.policies.run_folder import read_resume, read_run_config
 from flowlab.registry import POLICIES
@@ -37,9 +39,10 @@ def run_experiment(
     *,
     engine: str = "local",
     workers: int | None = None,
+    shard: JobShard = JobShard(),
     on_progress: OnProgress | None = None,
 ) -> list[PolicyResult]:
-    """Do what has not been done yet, and return all results.
+    """Do what has not been done yet, and return all results that there are then.
 
     A unit is done once its JSON is in ``out/units``; runs and datasets are needed only until then.
 
@@ -48,10 +51,11 @@ def run_experiment(
         out: The folder of the experiment.
         engine: Name or import path of what runs the workers.
         workers: Policies trained at a time; by default one for each core that this process may use.
+        shard: Which part of the units to do, where several jobs do an experiment together.
         on_progress: Told results as they come, at first those of earlier calls, if something is left to do.
 
     Returns:
-        The result of every unit, in the order of :func:`flowlab.benchmark.units.plan_units`.
+        The result of every unit that is done, in the order of :func:`flowlab.benchmark.units.plan_units`.
 
     Raises:
         UsageError: A name of the recipe does not exist, or its settings do not fit each other.
@@ -60,14 +64,27 @@ def run_experiment(
     """
     units = plan_units(recipe)
     report = on_progress or (lambda fresh, done, of: None)
-    known = {u.name: result for u in units if (result := _known_result(out, u, recipe)) is not None}
-    todo = [u for u in units if u.name not in known]
+    known = known_results(recipe, units, out)
+    todo = [u for u in share_of_units(units, shard) if u.name not in known]
     start_engine: StartUnits = engine_by_name(engine, workers, [__name__])
+    for name in known:
+        _discard_run(recipe, out, name)  # a kill may have left it
     _extract(recipe, todo, out, engine, workers)
     report(list(known.values()) if todo else [], len(known), len(units))
     if todo:
         _run_units(recipe, todo, out, start_engine, known, lambda r: report([r], len(known), len(units)))
-    return [known[u.name] for u in units]
+    return [known[u.name] for u in units if u.name in known]
+
+
+def known_results(recipe: ExperimentRecipe, units: Sequence[ExperimentUnit], out: Path) -> dict[str, PolicyResult]:
+    """The results that are there, by the names of their units.
+
+    Whatever machine made them: what counts is the settings and the episodes.
+
+    Raises:
+        DataError: One is damaged, or was made with other settings.
+    """
+    return {u.name: result for u in units if (result := _known_result(out, u, recipe)) is not None}
 
 
 def run_unit(recipe: ExperimentRecipe, out: Path, unit: ExperimentUnit) -> str:
@@ -81,6 +98,7 @@ def run_unit(recipe: ExperimentRecipe, out: Path, unit: ExperimentUnit) -> str:
     result = describe_run(folder, evaluations)
     renamed = {"name": unit.name, "label": unit.label, "tasks": (unit.task,)}
     write_result(unit_path(out, unit.name), result.model_copy(update=renamed))
+    _discard_run(recipe, out, unit.name)
     return unit.name
 
 
@@ -106,6 +124,12 @@ def _run_units(
             on_result(known[ended.receipt])
     if failures:
         raise UnfinishedError(f"{len(failures)} units failed, the first {failures[0]}; the same command tries again")
+
+
+def _discard_run(recipe: ExperimentRecipe, out: Path, name: str) -> None:
+    """Delete the run of a unit that is done, where the recipe keeps none."""
+    if not recipe.keep_runs and (folder := out / RUNS / name).is_dir():
+        shutil.rmtree(folder)
 
 
 def _train(data: Path, folder: Path, settings: TrainSettings, device: str) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from flowlab.config import Settings, explain, read_named
 from flowlab.errors import UsageError, unknown_name
@@ -16,11 +16,11 @@ from flowlab.untrusted import parse_yaml
 class PolicyVariant(Settings):
     """A policy with other settings."""
 
-    name: str
-    """What is added to the policy's name."""
+    name: str = ""
+    """What is added to the policy's name; nothing for a policy as it is, on these tasks only."""
     tasks: tuple[str, ...]
     """Tasks or groups; those that are not among the experiment's are left out."""
-    set: tuple[str, ...]
+    set: tuple[str, ...] = ()
     """Settings of training, as for ``flowlab train --set``."""
     policy: str = "fdp"
     """Name or import path of its kind."""
@@ -42,8 +42,10 @@ class ExperimentRecipe(Settings):
     """In the datasets; a policy takes as many of them as its settings say."""
     profile: str
     """Of training."""
-    minutes: PositiveFloat
+    minutes: PositiveFloat | None = None
     """Of training: CPU time of one thread, and on a GPU by the clock."""
+    steps: PositiveInt | None = None
+    """Of training, instead of ``minutes``: what comes out then depends on no machine's speed."""
     set: tuple[str, ...] = ()
     """Settings of training for all, as for ``flowlab train --set``."""
     seeds: tuple[int, ...]
@@ -53,6 +55,14 @@ class ExperimentRecipe(Settings):
     """Of the first seed, for every checkpoint but the last; 0 draws no learning curves."""
     variants: tuple[PolicyVariant, ...] = ()
     device: str = "auto"
+    keep_runs: bool = True
+    """Whether the training run of a finished unit is kept, which has some 100 MB; its result always is."""
+
+    @model_validator(mode="after")
+    def _says_how_long(self) -> "ExperimentRecipe":
+        if (self.minutes is None) == (self.steps is None):
+            raise ValueError("give either minutes or steps of training")
+        return self
 
 
 def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
@@ -79,11 +89,11 @@ def load_experiment(name: str, **changes: Any) -> ExperimentRecipe:
 
 def with_variants(recipe: ExperimentRecipe, names: Sequence[str]) -> ExperimentRecipe:
     """Only these of the variants. Raises :class:`UsageError` where the recipe has none of a name."""
-    known = {v.name: v for v in recipe.variants}
+    known = {v.name for v in recipe.variants}
     for name in names:
         if name not in known:
             raise unknown_name("variant of this recipe", name, known)
-    return recipe.model_copy(update={"variants": tuple(known[name] for name in names)})
+    return recipe.model_copy(update={"variants": tuple(v for v in recipe.variants if v.name in names)})
 
 
 def expand_tasks(names: Sequence[str]) -> tuple[str, ...]:

@@ -1,11 +1,13 @@
 """Results of experiments on disk, and those of runs that were evaluated."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
+from flowlab.benchmark.episode_columns import columns_path, read_columns, write_columns
 from flowlab.benchmark.migrations import migrate_result
 from flowlab.checksums import with_checksum, without_checksum
 from flowlab.config import explain
@@ -15,9 +17,12 @@ from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.files import remove_leftovers, told_when_unwritable, write_atomically
 from flowlab.policies.checkpoint import read_trained
+from flowlab.text import shown
 from flowlab.untrusted import is_there, read_json
 
 _ADVICE = "restore it, or delete it and the experiment does it again"
+_EPISODES = "episodes_sha256"
+"""Key that tells the checksum of the episodes beside a result; earlier results hold their episodes."""
 UNITS = "units"
 """Folder of an experiment that holds its results."""
 
@@ -28,25 +33,50 @@ def unit_path(experiment: Path, name: str) -> Path:
 
 
 def write_result(path: Path, result: PolicyResult) -> None:
-    """Write a result as JSON, in one step. Every episode is a line of its own."""
-    text = json.dumps(with_checksum(result.model_dump(mode="json", exclude_defaults=True)))
+    """Write a result: its episodes as columns, and then what else is known of it as JSON; it counts from then on."""
     with told_when_unwritable(path, "make room, then give the same command again"):
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(path.parent)
-        write_atomically(path, text.replace(' {"task":', '\n{"task":').replace('[{"task":', '[\n{"task":') + "\n")
+        values = result.model_dump(
+            mode="json", exclude_defaults=True, exclude={"evaluations": {"__all__": {"outcomes"}}}
+        )
+        values[_EPISODES] = write_columns(columns_path(path), result.evaluations)
+        write_atomically(path, json.dumps(with_checksum(values)) + "\n")
 
 
 def read_result(path: Path) -> PolicyResult:
-    """The inverse of :func:`write_result`; what older versions wrote is read too.
+    """The inverse of :func:`write_result`; what older versions wrote, all of it JSON, is read too.
 
     Raises:
-        DataError: The file is damaged.
+        DataError: A file is damaged.
     """
     values = without_checksum(read_json(path, _ADVICE), str(path), _ADVICE)
     try:
+        if isinstance(values, dict) and _EPISODES in values:
+            values = _with_episodes(values, path)
         return PolicyResult.model_validate(migrate_result(values))
     except ValidationError as error:
         raise DataError(f"{path}: {explain(error, PolicyResult)}; {_ADVICE}") from error
+
+
+def _with_episodes(values: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The values of a result, with the episodes that are beside it."""
+    values = dict(values)
+    episodes = read_columns(
+        columns_path(path), values.pop(_EPISODES), f"restore it, or delete {path} and the experiment does it again"
+    )
+    evaluations = values.get("evaluations")
+    for e in evaluations if isinstance(evaluations, list) else ():
+        if isinstance(e, dict):
+            asked = (e.get("step"), e.get("n_action_steps"))
+            e["outcomes"] = next((episodes.pop(key) for key in episodes if key == asked), [])
+    if episodes:
+        step, n_action_steps = next(iter(episodes))
+        raise DataError(
+            f"{columns_path(path)}: has episodes at step {shown(step)}, {shown(n_action_steps)} steps executed, of "
+            f"which {path} knows nothing; {_ADVICE}"
+        )
+    return values
 
 
 def read_results(folders: Sequence[Path]) -> list[PolicyResult]:

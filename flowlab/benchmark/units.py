@@ -1,12 +1,15 @@
 """The units of an experiment: each one policy on one task, with all its settings."""
 
+import json
 from collections import Counter
+from collections.abc import Sequence
 
 from flowlab.benchmark.recipe import ExperimentRecipe, PolicyVariant, expand_tasks, final_trials
 from flowlab.config import Settings
 from flowlab.data.training_settings import TrainSettings
 from flowlab.engines.base import core_count
 from flowlab.errors import UsageError, unknown_name
+from flowlab.pipeline.units import JobShard
 from flowlab.policies.profiles import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
 
@@ -46,7 +49,10 @@ def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
 
 
 def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) -> str:
-    """A sentence on how long training will take."""
+    """A sentence on how long training will take; where only its steps are known, on how many there are."""
+    if recipe.minutes is None:
+        episodes = len(set(recipe.seeds)) * recipe.episodes
+        return f"{units} policies, {recipe.steps} steps of training and {episodes} episodes each"
     workers = workers or core_count()
     hours = units * recipe.minutes / 60
     return (
@@ -55,14 +61,20 @@ def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) 
     )
 
 
+def share_of_units(units: Sequence[ExperimentUnit], shard: JobShard) -> list[ExperimentUnit]:
+    """A job's part of the units: those of every ``count``-th dataset, so that no two jobs make the same one."""
+    datasets = list(dict.fromkeys(u.dataset for u in units))[shard.index :: shard.count]
+    return [u for u in units if u.dataset in datasets]
+
+
 def _unit(recipe: ExperimentRecipe, task: str, policy: str, variant: PolicyVariant | None = None) -> ExperimentUnit:
     """One policy on one task, with the settings of the recipe and of its variant."""
-    label = policy if variant is None else f"{policy}-{variant.name}"
+    label = f"{policy}-{variant.name}" if variant and variant.name else policy
     changes = [
         f"data.demonstrations={recipe.demonstrations}",
         "data.held_out=1",
-        f"run.minutes={recipe.minutes}",
-        "run.steps=null",
+        f"run.minutes={json.dumps(recipe.minutes)}",
+        f"run.steps={json.dumps(recipe.steps)}",
         *recipe.set,
         *(variant.set if variant else ()),
     ]

@@ -12,7 +12,9 @@ from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
 
 if TYPE_CHECKING:
+    from flowlab.benchmark.recipe import ExperimentRecipe
     from flowlab.evaluation.results import PolicyResult
+    from flowlab.pipeline.units import JobShard
 
 
 @click.command()
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 @click.option("--seeds", metavar="N,...", help="Evaluation seeds  [the recipe's].")
 @click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
 @click.option("--workers", type=click.IntRange(min=1), help="Policies trained at a time  [one for each core].")
+@click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0) of the tasks, for job arrays.")
 @click.option("--device", help="Where to train: cpu, cuda  [a GPU if there is one].")
 @click.option("--dry-run", is_flag=True, help="Say what would be done; do nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON, and no progress.")
@@ -42,6 +45,7 @@ def bench(
     seeds: str | None,
     engine: str,
     workers: int | None,
+    shard: str,
     device: str | None,
     dry_run: bool,
     as_json: bool,
@@ -51,36 +55,43 @@ def bench(
     \b
       flowlab bench --group hard --policies fdp,dp3,mba --budget 10m --out results/hard
       flowlab bench --out results/paper
+      flowlab bench --recipe table1 --out results/table1 --shard 0/4    # the other parts: 1/4, 2/4, 3/4
+
+    Recipes that come with flowlab: paper, and the paper's tables whole: table1 and ablations.
 
     Every policy is a unit of work, done by one process. Ended early, the same command does the rest: a unit is done
-    once its result is in OUT/units, and neither runs nor datasets are needed for it then.
+    once its result is in OUT/units, and neither runs nor datasets are needed for it then. The parts of --shard may
+    share one OUT, or have one each whose OUT/units are brought together.
     """
     from flowlab.benchmark.experiment import run_experiment
     from flowlab.benchmark.recipe import load_experiment, with_variants
     from flowlab.benchmark.summary import summarize
-    from flowlab.benchmark.units import plan_cost, plan_units
+    from flowlab.pipeline.units import JobShard
     from flowlab.report.tables import summary_tables
     from flowlab.report.write import write_report
 
     changes: dict[str, Any] = {
         "tasks": (*groups, *tasks) or None,
         "policies": tuple(_names(policies)) if policies else None,
-        "minutes": _minutes(budget) if budget else None,
         "episodes": episodes,
         "seeds": parse_seeds(seeds) if seeds else None,
         "device": device,
     }
-    asked = load_experiment(recipe, **{k: v for k, v in changes.items() if v is not None})
+    changes = {k: v for k, v in changes.items() if v is not None}
+    if budget:
+        changes |= {"minutes": _minutes(budget), "steps": None}
+    part = JobShard.parse(shard)
+    asked = load_experiment(recipe, **changes)
     if variants is not None:
         asked = with_variants(asked, [] if variants == "none" else _names(variants))
     if dry_run:
-        units = plan_units(asked)
-        for unit in units:
-            echo(unit.name)
-        echo(plan_cost(asked, len(units), workers))
+        _say_what_is_left(asked, out, part, workers)
         return
     progress = None if as_json else _print_progress
-    results = run_experiment(asked, out, engine=engine, workers=workers, on_progress=progress)
+    results = run_experiment(asked, out, engine=engine, workers=workers, shard=part, on_progress=progress)
+    if not results:
+        say(f"nothing of this experiment is done yet, and nothing of it belongs to part {shard}")
+        return
     summary = summarize(results)
     write_report(out, summary, results)
     if as_json:
@@ -90,12 +101,32 @@ def bench(
     echo_report(out)
 
 
+def _say_what_is_left(recipe: "ExperimentRecipe", out: Path, shard: "JobShard", workers: int | None) -> None:
+    """Name the units that a run would do, and say what they cost and how many are done."""
+    from flowlab.benchmark.experiment import known_results
+    from flowlab.benchmark.units import plan_cost, plan_units, share_of_units
+
+    units = plan_units(recipe)
+    known = known_results(recipe, units, out)
+    left = [u for u in share_of_units(units, shard) if u.name not in known]
+    for unit in left:
+        echo(unit.name)
+    if known:
+        echo(_standing(len(known), len(units)))
+    echo(plan_cost(recipe, len(left), workers))
+
+
 def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> None:
     """Say how new results went, and how many are there."""
     for r in fresh:
         solved = sum(o.success for o in r.final)
         say(f"{r.name}: {solved} of {len(r.final)} solved")
-    say(f"{done} of {total} policies done")
+    say(_standing(done, total))
+
+
+def _standing(done: int, total: int) -> str:
+    """How far the whole experiment is."""
+    return f"{done} of {total} policies done" + (f", {total - done} left" if done < total else "")
 
 
 def _names(text: str) -> list[str]:

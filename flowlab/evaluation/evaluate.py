@@ -1,5 +1,6 @@
 """Evaluate trained policies: which episodes are missing, who tries them, and what came out."""
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -128,11 +129,16 @@ def evaluate_checkpoints(
 
 
 def evaluate_here(checkpoint: CheckpointRef, trials: Sequence[Trial], device: str = "cpu") -> CheckpointEvaluation:
-    """Try what has not been tried yet in this process, and return all results."""
+    """Try what has not been tried yet in this process, and return all results, with the CPU time they took."""
     check_unseen(trials, checkpoint.trained.scene_seeds, checkpoint.run)
+    began, tried = time.process_time(), 0
     for batch in _missing_batches(checkpoint, trials, 1, device):
-        run_batch(batch)
-    return checkpoint.read_evaluation(trials)
+        tried += run_batch(batch)
+    found = checkpoint.read_evaluation(trials)
+    if not tried:
+        return found
+    spent = time.process_time() - began
+    return found.model_copy(update={"cpu_s": round(spent * len(trials) / tried, 1)})
 
 
 def run_batch(batch: EpisodeBatch) -> int:

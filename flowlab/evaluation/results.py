@@ -76,6 +76,9 @@ class CheckpointEvaluation(Settings):
     """Training steps its weights have seen."""
     n_action_steps: int
     """Steps of every plan that were executed."""
+    cpu_s: float | None = None
+    """CPU time of its episodes where one process tried them [s]; if it was ended early, that of those it tried after
+    it went on, by their share of all."""
     outcomes: tuple[EpisodeResult, ...]
 
 

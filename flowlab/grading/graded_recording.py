@@ -125,6 +125,7 @@ def write_graded(
         time_s=rollout.time_s,
         success=bool(rollout.success[-1]),
         task=rollout.task,
+        rendered=True,
         depth_unit_m=_DEPTH_UNIT_M,
         T_world_cam=rollout.T_world_cam if poses_known else None,
         **samples,

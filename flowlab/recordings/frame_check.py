@@ -85,6 +85,7 @@ def check_frames(
     max_state_s: float,
     pose_gap_s: float = 0.0,
     stated: Mapping[str, float] | None = None,
+    rendered: bool = False,
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
@@ -92,7 +93,7 @@ def check_frames(
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
     an interval; where no poses of a camera that moves are around it that are at most ``pose_gap_s`` apart; and where
     its time does not lie after the frame before. ``stated`` is what the user has added to
-    the times of a stream.
+    the times of a stream, ``rendered`` whether equal pictures without noise are right.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
@@ -131,7 +132,7 @@ def check_frames(
     rows = np.array(good, np.int64).reshape(-1, 2)
     digests = [{i: look.digest for i, look in looks.items() if look.digest is not None} for looks in (color, depth)]
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
-    frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state)
+    frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state, rendered=rendered)
     told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
     checks = (repeats, *motion_checks(streams, told[0], told[1], stated or {}))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]

@@ -68,7 +68,7 @@ def frozen_rows(values: Float64[np.ndarray, "T D"]) -> str:
     usual = float(np.median(step[~same])) if (~same).any() else np.inf
     for first, last in runs(same):
         others = np.delete(same, np.s_[first:last])
-        if last - first + 1 < _FROZEN or others.mean() > _USUAL:
+        if last - first + 1 < _FROZEN or not len(others) or others.mean() > _USUAL:
             continue
         leaps = [step[k] for k in (first - 1, last) if 0 <= k < len(step)]
         if leaps and max(leaps) > _LEAP * usual:

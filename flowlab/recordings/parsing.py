@@ -156,6 +156,7 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         max_state_s=settings.max_state_s,
         pose_gap_s=most_apart_s(streams.color, metadata.T_world_cam_gap_s),
         stated={s: off for s in ("depth", "state") if (off := getattr(metadata, f"{s}_offset_s")) is not None},
+        rendered=metadata.rendered,
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
 

@@ -30,6 +30,8 @@ _WIDTH = 214
 _LEAST_SIDE = 24
 _ENOUGH = 0.05
 """Share of the pixels that two rows must both show."""
+_POINTS = 2000
+"""About so many points of two rows are compared, at most twice as many: enough for a median."""
 _THERE_AND_BACK_PX = 0.7
 """Flow that does not come back to within this is not believed, in pixels of small pictures."""
 _TEXTURE = 2.0
@@ -161,13 +163,14 @@ def _best_offset(source: "ParsedRecording", pairs: list[_Pair]) -> tuple[float, 
     poses, clock = source.streams.poses, source.streams.color.time_s[source.frame_check.color]
     assert poses is not None
     here, _ = poses_at(poses, clock, np.inf)
+    as_it_is = np.array([p.off_m(here) for p in pairs])
     found = []
     for late in _OFFSETS_S:
         T, known = poses_at(poses, clock - late, np.inf)
-        mine = [p for p in pairs if known[list(p.rows)].all()]
-        better = sum(p.off_m(T) < p.off_m(here) for p in mine)
-        if 2 * len(mine) >= len(pairs) and better >= _MOST * len(mine):
-            found.append((_off_m(mine, T), late, _off_m(mine, here)))
+        mine = np.array([known[list(p.rows)].all() for p in pairs])
+        off = np.array([p.off_m(T) for p, is_known in zip(pairs, mine, strict=True) if is_known])
+        if 2 * mine.sum() >= len(pairs) and (off < as_it_is[mine]).sum() >= _MOST * mine.sum():
+            found.append((float(off.mean()), late, float(as_it_is[mine].mean())))
     best, late, unshifted = min(found, default=(np.inf, 0.0, np.inf))
     return late, best, unshifted
 
@@ -248,7 +251,8 @@ def _matched(flow: "cv2.DISOpticalFlow", rows: tuple[int, int], one: _Taken, oth
     if good.sum() < _ENOUGH * good.size:
         return None
     px = float(np.median(np.linalg.norm(there[good], axis=-1)))
-    return _Pair(rows, points_a[good], second[good], px, _pixel_rad(points_a), a.shape[1])
+    some = slice(None, None, max(1, int(good.sum()) // _POINTS))
+    return _Pair(rows, points_a[good][some], second[good][some], px, _pixel_rad(points_a), a.shape[1])
 
 
 def _pixel_rad(points: np.ndarray) -> float:

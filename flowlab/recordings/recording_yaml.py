@@ -111,6 +111,8 @@ class Metadata(FiniteSettings):
     """File with the time of every row of actions [s]."""
     one_robot: bool = False
     """Whether state and actions are one robot's though they leap as those of two that publish in turn."""
+    rendered: bool = False
+    """Whether the pictures were rendered: where they have no noise, equal ones are no sign of a camera that froze."""
     success: bool = True
     """Whether the demonstration solved its task."""
     task: str | None = None

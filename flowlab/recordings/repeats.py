@@ -115,6 +115,8 @@ def find_repeats(
     depth: Mapping[int, PictureDigest],
     rows: Int64[np.ndarray, "T 2"],
     state: Num[np.ndarray, "T S"],
+    *,
+    rendered: bool = False,
 ) -> tuple[dict[int, str], Check]:
     """Rows whose picture is that of a row before, while time went on, and what to say of it.
 
@@ -128,6 +130,7 @@ def find_repeats(
         depth: Likewise of depth pictures.
         rows: Indices of the color and depth picture of every row that is good otherwise.
         state: What the robot was at each.
+        rendered: Whether pictures are said to be rendered; that is believed of streams without noise.
 
     Returns:
         The reason of every row that is bad, by its place in ``rows``; and the check.
@@ -144,6 +147,9 @@ def find_repeats(
     at_once: set[int] = set()
     for one, other in (seen, seen[::-1]):
         for first, last in runs(one.same):
+            if rendered and not one.noisy:
+                still.update(range(first + 1, last + 1))
+                continue
             proven = one.froze(first, last) or other.moved(first, last) or _robot_moved(state, first, last)
             again = range(first + 1, last + 1)
             if proven and (last - first + 1 >= _RUN or one.cadence is not None):
@@ -162,7 +168,7 @@ def find_repeats(
         doubts += _stale(name, one, other, {*older, *(np.flatnonzero(one.same) + 1).tolist()})
     return bad, _check(
         bad, {k: n for k, n in named.items() if k not in bad}, still - {*bad, *named, *at_once}, at_once - {*bad},
-        doubts, seen,
+        doubts, seen, rendered=rendered,
     )  # fmt: skip
 
 
@@ -191,6 +197,8 @@ def _check(
     at_once: set[int],
     doubts: Sequence[str],
     seen: tuple[_Pictures, _Pictures],
+    *,
+    rendered: bool,
 ) -> Check:
     """What came of looking for repeats."""
     rows = len(seen[0].kept)
@@ -198,7 +206,9 @@ def _check(
     if named:
         says += f"; {len(named)} pictures equal the one before: {', '.join(list(named.values())[:3])}"
     if still:
-        says += f"; {len(still)} equal the one before while nothing else moved, as in a scene that stands still"
+        why = ", and have no noise, as rendered ones do" if rendered else (
+            " while nothing else moved, as in a scene that stands still")  # fmt: skip
+        says += f"; {len(still)} equal the one before{why}"
     if at_once:
         says += (
             f"; {len(at_once)} equal the one before, from {seen[0].name(min(at_once))} on, and next to them everything "

@@ -30,6 +30,7 @@ def write_rgbd_recording(
     action: Float[np.ndarray, "T A"] | None = None,
     success: bool = True,
     task: str | None = None,
+    rendered: bool = False,
     depth_unit_m: float = 0.001,
     T_world_cam: Float[np.ndarray, "T 4 4"] | None = None,
     query_px: Float32[np.ndarray, "N 2"] | None = None,
@@ -50,6 +51,7 @@ def write_rgbd_recording(
         action: What it then did.
         success: Whether the demonstration solved its task.
         task: What the robot does.
+        rendered: Whether the pictures were rendered, so that equal ones are no sign of a camera that froze.
         depth_unit_m: What depth is rounded to: 0.0001 holds 6.5 m at a tenth of a millimeter.
         T_world_cam: The pose of a camera that moves, at each picture; it wins over that of ``camera``.
         query_px: Pixels (x, y) of the first frame whose true tracks are known, for ``ground_truth.npz``.
@@ -82,7 +84,9 @@ def write_rgbd_recording(
                 np.save(temporary / f"{name}.npy", values)
             if poses is not None:
                 np.save(temporary / _POSES, poses)
-            about = _yaml(camera, list(samples), float(depth_unit_m), success, task, moves=poses is not None)
+            about = _yaml(
+                camera, list(samples), float(depth_unit_m), success, task, rendered=rendered, moves=poses is not None
+            )
             (temporary / FILE_NAME).write_text(about)
             if query_px is not None:
                 np.savez_compressed(temporary / TRUE_TRACKS, **known)
@@ -198,7 +202,14 @@ def _poses(T_world_cam: Any, steps: int) -> Float64[np.ndarray, "T 4 4"]:
 
 
 def _yaml(
-    camera: Camera, files: list[str], depth_unit_m: float, success: bool, task: str | None, *, moves: bool
+    camera: Camera,
+    files: list[str],
+    depth_unit_m: float,
+    success: bool,
+    task: str | None,
+    *,
+    rendered: bool,
+    moves: bool,
 ) -> str:
     """The content of ``recording.yaml``."""
     intrinsics = Intrinsics.from_matrix(camera.K, width=camera.width, height=camera.height)
@@ -208,6 +219,7 @@ def _yaml(
         f"intrinsics: {intrinsics.to_yaml()}",
         f"T_world_cam_file: {_POSES}" if moves else f"T_world_cam: {np.asarray(camera.T_world_cam, float).tolist()}",
         *(f"{name}: {name}.npy" for name in files),
+        *(["rendered: true"] if rendered else []),
         f"success: {str(bool(success)).lower()}",
         *([yaml.safe_dump({"task": task}).strip()] if task is not None else []),
     ]

@@ -7,7 +7,7 @@ import numpy as np
 
 from flowlab.geometry.camera import pose_fault
 from flowlab.provenance import Provenance
-from flowlab.records import Episode, PositionSource
+from flowlab.records import Episode, PositionSource, Sight
 from flowlab.storage.schema import SCHEMA
 
 TELEPORT = 0.15
@@ -128,6 +128,14 @@ def _quality(e: Episode) -> Iterator[ArrayProblem]:
             "is measured, yet the sensor gave no depth",
         ),
     }
+    if quality.sight is not None:
+        unseen = (quality.sight != Sight.SEEN) & (quality.sight != Sight.NO_READING)
+        wrong["sight"] = (
+            (quality.sight > max(Sight))
+            | (e.tracks.visible & unseen)
+            | (~e.tracks.visible & (quality.sight == Sight.SEEN)),
+            "has a sight that is none, or not that of a point that is visible or not",
+        )
     for name in ("forward_backward", "disagreement", "residual"):
         values = getattr(quality, name)
         wrong[name] = ((values < 0) & (values != -1), "is below 0, and not the -1 that stands for unknown")

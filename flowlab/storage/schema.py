@@ -118,6 +118,10 @@ SCHEMA = (
         "residual", "float32", "1",
         "how badly the fitted motion explains color and depth around the point, 0 to 1; -1 where there is none",
     ),
+    _quality(
+        "sight", "uint8", "1",
+        "whether the sensor sees the point: 0 seen, 1 covered, 2 out of view, 3 no reading, 4 seen through",
+    ),
     ArraySpec("meta/seed", "int64", ("episode",), "1", "seed of the episode", lambda e: _row(e.seed, "int64")),
     ArraySpec(
         "meta/success", "bool", ("episode",), "1", "whether the task was solved at any step",
@@ -147,8 +151,9 @@ SCHEMA = (
         lambda e: _row(e.tracks.association_distance, "float32"),
     ),
 )  # fmt: skip
-QUALITY = tuple(f"data/{name.name}" for name in fields(Quality))
-"""The arrays of :class:`~flowlab.records.Quality`: all of them or none."""
+SIGHT = "data/sight"
+QUALITY = tuple(path for field in fields(Quality) if (path := f"data/{field.name}") != SIGHT)
+"""The arrays of :class:`~flowlab.records.Quality`: all of them or none, but for ``SIGHT``, which older shards lack."""
 POSES = "data/T_world_cam"
 EPISODE_ENDS = "meta/episode_ends"
 """int64 (episode,): the row after each episode's last; written beside the arrays of the schema."""

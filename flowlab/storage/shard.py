@@ -18,7 +18,7 @@ from flowlab.errors import DataError, RecordError, first_line
 from flowlab.files import new_file
 from flowlab.geometry.camera import Camera
 from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
-from flowlab.storage.schema import EPISODE_ENDS, POSES, QUALITY, SCHEMA, SCHEMA_VERSION, ArraySpec
+from flowlab.storage.schema import EPISODE_ENDS, POSES, QUALITY, SCHEMA, SCHEMA_VERSION, SIGHT, ArraySpec
 from flowlab.storage.shard_files import open_files, write_zip
 from flowlab.storage.stored_array import StoredArray, stored_array
 from flowlab.text import shown
@@ -183,7 +183,7 @@ class Shard:
 def _quality(columns: Mapping[str, np.ndarray]) -> Quality | None:
     if not any(path in columns for path in QUALITY):
         return None
-    return Quality(**{path.removeprefix("data/"): columns[path] for path in QUALITY})
+    return Quality(**{path.removeprefix("data/"): columns[path] for path in QUALITY}, sight=columns.get(SIGHT))
 
 
 REPAIR = "run the command that made the dataset again, with --repair: it makes this unit anew"

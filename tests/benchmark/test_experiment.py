@@ -1,6 +1,8 @@
 """``flowlab bench`` as a user runs it: every unit is done once, however often the experiment is ended and begun."""
 
 import csv
+import gzip
+import hashlib
 import json
 import math
 import os
@@ -20,11 +22,15 @@ import yaml
 from synthetic import call_cli, files_below
 from trained_runs import NETWORK, header_of, lines_of, make_run, options, policy_of, weights_of
 
+from flowlab.benchmark.paper import CURVE_TASKS, QUERY_PLACES
 from flowlab.benchmark.recipe import load_experiment
+from flowlab.benchmark.results import read_result, write_result
 from flowlab.benchmark.units import plan_units
 from flowlab.checksums import with_checksum
 from flowlab.cli import main
+from flowlab.limits import MAX_TEXT_BYTES
 from flowlab.policies.run_folder import read_resume, save_resume
+from flowlab.sim.tasks import TASKS
 from flowlab.storage.dataset import Dataset
 
 Capture = pytest.CaptureFixture[str]
@@ -96,10 +102,14 @@ def experiment(recipe: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def unit(out: Path, name: str) -> dict[str, Any]:
-    """Without its digest."""
-    values = json.loads((out / f"units/{name}.json").read_text())
-    assert values.pop("sha256")
+    values: dict[str, Any] = read_result(out / f"units/{name}.json").model_dump(mode="json", exclude_defaults=True)
     return values
+
+
+def without_times(result: dict[str, Any]) -> dict[str, Any]:
+    """But for how long its episodes took, which were tried already."""
+    evaluations = [{k: v for k, v in e.items() if k != "cpu_s"} for e in result["evaluations"]]
+    return result | {"evaluations": evaluations}
 
 
 def bench(capsys: Capture, out: Path, recipe: Path, *more: str) -> tuple[int, str, str]:
@@ -110,7 +120,9 @@ def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: 
     assert sorted(p.name for p in experiment.iterdir() if p.is_dir() and p.name != "figures") == [
         "data", "runs", "units",
     ]  # fmt: skip
-    assert sorted(p.stem for p in (experiment / "units").iterdir()) == UNITS
+    assert sorted(p.name for p in (experiment / "units").iterdir()) == sorted(
+        f"{name}{end}" for name in UNITS for end in (".csv.gz", ".json")
+    )
     for name in UNITS:
         found, run = unit(experiment, name), experiment / "runs" / name
         policy, _, variant = name.removeprefix(f"{TASK}-").partition("-")
@@ -198,11 +210,12 @@ def test_a_unit_that_is_lost_is_done_again_alone(
 ) -> None:
     """From the run and the episodes that are there: it comes out as it was, and the rest is not touched."""
     out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
-    (out / f"units/{UNITS[1]}.json").unlink()
+    for end in (".json", ".csv.gz"):
+        (out / f"units/{UNITS[1]}{end}").unlink()
     before = files_below(out)
     code, _, err = bench(capsys, out, recipe, "--workers", "1")
     assert code == 0, err
-    assert unit(out, UNITS[1]) == unit(experiment, UNITS[1])
+    assert without_times(unit(out, UNITS[1])) == without_times(unit(experiment, UNITS[1]))
     after = files_below(out)
     assert {name: after[name] for name in before if name.startswith("units")} == {
         name: was for name, was in before.items() if name.startswith("units")
@@ -275,6 +288,131 @@ def test_a_damaged_unit_is_said(experiment: Path, recipe: Path, tmp_path: Path, 
         assert err.count("\n") == 1
 
 
+def test_the_episodes_of_a_unit_are_columns_that_others_read(experiment: Path) -> None:
+    """As ``episodes.csv`` has them; the same result is the same bytes."""
+    for name in UNITS:
+        place = experiment / f"units/{name}.csv.gz"
+        with gzip.open(place, "rt", newline="") as file:
+            rows = list(csv.DictReader(file))
+        with (experiment / "episodes.csv").open(newline="") as file:
+            wanted = [row for row in csv.DictReader(file) if row.pop("result") == name and row.pop("label")]
+        assert rows == wanted
+        result = read_result(experiment / f"units/{name}.json")
+        before = place.read_bytes()
+        write_result(experiment / f"units/{name}.json", result)
+        assert place.read_bytes() == before
+        assert [e.cpu_s is not None and e.cpu_s > 0 for e in result.evaluations] == [True, True]
+
+
+def spoil(columns: Path, how: str) -> None:
+    """Change a file of episodes; where it is not to be known by its checksum, that is set anew."""
+    rows = gzip.decompress(columns.read_bytes()).decode()
+    if how == "cut":
+        columns.write_bytes(columns.read_bytes()[:-9])
+        return
+    changed = {
+        "number": rows.replace(",1000000,", ",many,"),
+        "column": rows.replace("n_action_steps", "executed"),
+        "row": rows + "1,2\n",
+        "evaluation": rows.replace("\n2,8,", "\n3,8,"),
+        "zeros": rows + "0" * (MAX_TEXT_BYTES + 1),
+    }
+    packed = gzip.compress(changed[how].encode())
+    columns.write_bytes(packed)
+    place = columns.with_name(columns.name.replace(".csv.gz", ".json"))
+    values = {k: v for k, v in json.loads(place.read_text()).items() if k != "sha256"}
+    place.write_text(json.dumps(with_checksum(values | {"episodes_sha256": hashlib.sha256(packed).hexdigest()})))
+
+
+SPOILED = {
+    "cut": "damaged (its content does not match its checksum)",
+    "number": "is no table of episodes",
+    "column": "is no table of episodes (it has no column n_action_steps)",
+    "row": "is no table of episodes",
+    "evaluation": "has episodes at step 3, 8 steps executed, of which",
+    "zeros": "is no table of episodes (it unpacks to more than",
+    "gone": "there is no such file",
+}
+
+
+@pytest.mark.parametrize("how", SPOILED)
+def test_damaged_episodes_are_said(how: str, experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "tiny"
+    shutil.copytree(experiment / "units", out / "units")
+    columns = out / f"units/{UNITS[1]}.csv.gz"
+    columns.unlink() if how == "gone" else spoil(columns, how)
+    for command in (("bench", "--out", out, "--recipe", recipe), ("report", out)):
+        code, said, err = call_cli(capsys, *command)
+        assert (code, said) == (3, "")
+        assert err.startswith(f"flowlab: {columns}: {SPOILED[how]}")
+        assert err.count("\n") == 1
+
+
+def test_what_another_kind_of_machine_made_is_the_same_experiment(
+    experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """Results count by their settings and episodes: not by processor, precision, library or time."""
+    out = tmp_path / "tiny"
+    for name in UNITS:
+        result = read_result(experiment / f"units/{name}.json")
+        other = {
+            "device": "cuda",
+            "precision": "fp32",
+            "processor": "another",
+            "cpu_s": 1e4,
+            "versions": {"torch": "9"},
+        }
+        training = result.training.model_copy(update=other)
+        write_result(out / f"units/{name}.json", result.model_copy(update={"training": training}))
+    before = files_below(out / "units")
+    code, _, err = bench(capsys, out, recipe, "--device", "cpu")
+    assert (code, err.splitlines()[-1]) == (0, "3 of 3 policies done")
+    assert files_below(out / "units") == before
+    assert not (out / "data").exists()
+
+
+def test_runs_that_nobody_keeps_are_gone_once_their_units_are_done(
+    experiment: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """Those of units that were done before, too."""
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    (out / f"units/{UNITS[1]}.json").unlink()
+    sparing = write_recipe(tmp_path, keep_runs=False)
+    code, _, err = bench(capsys, out, sparing, "--workers", "1")
+    assert code == 0, err
+    assert without_times(unit(out, UNITS[1])) == without_times(unit(experiment, UNITS[1]))
+    assert list((out / "runs").iterdir()) == []
+
+
+def test_parts_of_an_experiment_are_whole_tasks_and_together_all_of_it(
+    experiment: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = tmp_path / "tiny"
+    shutil.copytree(experiment / "units", out / "units")
+    more = write_recipe(tmp_path, tasks=["push", TASK, "reach"], minutes=None, steps=2, set=SHORT[2:])
+    asked = ("bench", "--out", tmp_path / "none", "--recipe", more, "--dry-run", "--shard")
+    parts = [call_cli(capsys, *asked, f"{k}/2")[1].splitlines() for k in range(2)]
+    assert [line for part in parts for line in part[:-1]] == [
+        "push-dp3", "push-fdp", "reach-dp3", "reach-fdp", "push-fdp-m4", *UNITS,
+    ]  # fmt: skip
+    assert parts[1][-1] == "3 policies, 2 steps of training and 2 episodes each"
+    code, said, err = bench(capsys, out, more, "--dry-run")
+    assert (code, said.splitlines()[-2:]) == (
+        0, ["3 of 8 policies done, 5 left", "5 policies, 2 steps of training and 2 episodes each"],
+    )  # fmt: skip
+    code, said, err = bench(capsys, out, more, "--shard", "1/2", "--json")
+    assert (code, err) == (0, "")
+    assert [result["name"] for result in json.loads(said)] == UNITS
+    code, said, err = bench(capsys, tmp_path / "none", more, "--shard", "3/4")
+    assert (code, said) == (0, "")
+    assert err.splitlines() == [
+        "0 of 8 policies done, 8 left",
+        "nothing of this experiment is done yet, and nothing of it belongs to part 3/4",
+    ]
+    code, said, err = bench(capsys, out, more, "--shard", "2/2")
+    assert (code, err) == (2, "flowlab: --shard 2/2: must be i/n with i from 0 to n-1, as in --shard 0/4\n")
+
+
 def test_a_dry_run_says_what_would_be_done(recipe: Path, tmp_path: Path, capsys: Capture) -> None:
     code, said, err = bench(capsys, tmp_path / "out", recipe, "--dry-run", "--workers", "2")
     assert (code, err) == (0, "")
@@ -317,6 +455,34 @@ def test_the_recipe_that_comes_with_flowlab_is_the_papers() -> None:
     ]
 
 
+def test_the_papers_tables_come_whole(capsys: Capture, tmp_path: Path) -> None:
+    """All tasks, the hardest first, equal steps for all policies; what varies in the ablations has the same steps."""
+    units = plan_units(load_experiment("table1"))
+    groups = list(dict.fromkeys(TASKS[u.task].difficulty for u in units))
+    assert groups == ["hard", "very-hard", "medium", "easy"]
+    assert [u.label for u in units] == ["fdp", "dp3", "mba"] * 50
+    assert {u.task for u in units} == set(TASKS)
+    ablations = plan_units(load_experiment("ablations"))
+    assert len({u.settings.run.steps for u in [*units, *ablations]}) == 1
+    assert {u.settings.run.seed for u in units} == {0}
+    tasks = {label: [u.task for u in ablations if u.label == label] for label in {u.label for u in ablations}}
+    hard = ["assembly", "hand-insert", "pick-out-of-hole", "pick-place", "push", "push-back"]
+    assert tasks["fdp-m50"] == tasks["fdp-m200"] == hard
+    assert {*hard, *QUERY_PLACES.columns, *CURVE_TASKS} == set(tasks["fdp"])
+    assert set(tasks["fdp-object"]) == set(tasks["fdp-stratified"]) == set(QUERY_PLACES.columns)
+    for label in ("dp3", "dp3-seed1", "dp3-seed2", "fdp-seed1", "fdp-seed2"):
+        assert set(tasks[label]) == set(CURVE_TASKS)
+    code, said, _ = call_cli(
+        capsys, "bench", "--recipe", "ablations", "--variants", "seed1", "--out", tmp_path, "--dry-run"
+    )
+    assert code == 0
+    assert [name for name in said.splitlines() if "seed" in name] == [
+        f"{task}-{policy}-seed1" for policy in ("fdp", "dp3") for task in CURVE_TASKS
+    ]
+    short = ("bench", "--recipe", "table1", "--budget", "1m", "--task", "push", "--out", tmp_path, "--dry-run")
+    assert call_cli(capsys, *short)[1].splitlines()[-1].startswith("3 policies, 1 minutes of training each: ")
+
+
 WRONG: dict[str, tuple[list[str], str]] = {
     "recipe": (["--recipe", "papr"], "no experiment is called 'papr'; did you mean paper?"),
     "recipe file": (["--recipe", "no.yaml"], "no.yaml: there is no such file, expected the experiment"),
@@ -349,7 +515,9 @@ def test_what_is_wrong_is_said_in_one_sentence(
 
 BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "key": ({"episods": 3}, "episods: no setting is called 'episods'; did you mean episodes"),
-    "key that is missing": ({"minutes": None}, "minutes: Field required"),
+    "key that is missing": ({"seeds": None}, "seeds: Field required"),
+    "neither minutes nor steps": ({"minutes": None}, "give either minutes or steps of training"),
+    "minutes and steps": ({"steps": 2}, "give either minutes or steps of training"),
     "value": ({"minutes": "soon"}, "minutes: "),
     "no time": ({"minutes": 0}, "minutes: "),
     "setting": ({"set": ["motoin.points=3"]}, "no setting of dp3 is called 'motoin'; there are: action, "),

@@ -51,6 +51,7 @@ def change(folder: Path, of: str, rng: random.Random) -> None:
 
 def seal(folder: Path) -> None:
     """Have every checksum of a dataset or a run be right, as somebody would who makes a wrong one."""
+    from flowlab.benchmark.episode_columns import columns_path
     from flowlab.checksums import CHECKSUM, json_checksum, sha256_of
 
     shards = {p.name.removesuffix(".zarr.zip"): p for p in folder.rglob("*.zarr.zip") if p.is_file()}
@@ -63,6 +64,8 @@ def seal(folder: Path) -> None:
                 if isinstance(values, dict) and CHECKSUM in values:
                     if file.parent.name == "receipts" and file.stem in shards and values.get("shard_sha256"):
                         values["shard_sha256"] = sha256_of(shards[file.stem])
+                    if "episodes_sha256" in values and (columns := columns_path(file)).is_file():
+                        values["episodes_sha256"] = sha256_of(columns)
                     line = json.dumps(values | {CHECKSUM: json_checksum(values)})
                 sealed.append(line)
             file.write_text("\n".join(sealed))

@@ -38,9 +38,9 @@ def options(*changes: str) -> list[str]:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two short demonstrations with color pictures."""
-    folder = tmp_path_factory.mktemp("data") / "drawer"
+    folder = tmp_path_factory.mktemp("data") / "slide"
     scene = options("expert.scene.renderer=gl", "expert.scene.rgb=true", "write.rgb=true")
-    done = flowlab("extract-sim", "drawer-open", "--episodes", 2, "--out", folder, "--workers", 1, *scene)
+    done = flowlab("extract-sim", "plate-slide", "--episodes", 2, "--out", folder, "--workers", 1, *scene)
     if "OpenGL" in done.stderr:
         pytest.skip(f"color pictures need OpenGL: {done.stderr.strip()[:200]}")
     assert done.returncode == 0, done.stderr
@@ -77,7 +77,7 @@ def test_it_is_evaluated_in_simulation(run: Path) -> None:
     assert done.returncode == 0, done.stderr
     (log,) = run.rglob("episodes.jsonl")
     tried = [json.loads(line) for line in log.read_text().splitlines()]
-    assert [(t["task"], t.get("note", "")) for t in tried] == [("drawer-open", "")] * 2
+    assert [(t["task"], t.get("note", "")) for t in tried] == [("plate-slide", "")] * 2
 
 
 def test_it_drives_a_robot_by_color(run: Path, data: Path, policy: type[PolicyNetwork]) -> None:

@@ -227,9 +227,9 @@ def test_every_bar_says_what_was_found_and_asked_for() -> None:
     assert bars(0.005, seen(0.125)).startswith(
         "12% of all positions are seen with a stated error below 50 mm, at least"
     )
-    assert bars(0.06, everything, min_sure_share=0.0) == ""
-    complaint = bars(0.12, everything, min_sure_share=0.0)
-    assert "median stated error of visible points is 120.0 mm, at most 100 mm" in complaint
+    assert bars(0.04, everything, min_sure_share=0.0) == ""
+    complaint = bars(0.06, everything, min_sure_share=0.0)
+    assert "median stated error of visible points is 60.0 mm, at most 50 mm" in complaint
     assert "stated error below 50 mm" in bars(0.06, everything)
     gone = everything.copy()
     gone[12:, :7] = False

@@ -136,6 +136,20 @@ def test_scenes_that_stand_still_froze_not(tmp_path: Path, inspect: Inspect, fra
     assert {c["verdict"] for c in facts["checks"] if c["about"] == "repeats"} <= {"ok", "assumed"}, facts["checks"]
 
 
+@pytest.mark.parametrize(("noise", "code"), [(0.0, 0), (2.0, 3)])
+def test_what_is_rendered_may_come_again_where_it_has_no_noise(
+    tmp_path: Path, inspect: Inspect, noise: float, code: int
+) -> None:
+    """Of depth pictures that stay while color changes, too; of pictures with noise that is not believed."""
+    path = write(tmp_path / "r", shown(held(20, 28), "depth", noise=noise))
+    assert_refused(inspect(path), "7 of 40 frames are bad", "it froze")
+    with (path / "recording.yaml").open("a") as file:
+        file.write("rendered: true\n")
+    found, facts = inspect(path)
+    assert found == code
+    assert code or facts["bad_frames"] == []
+
+
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 def test_a_robot_that_moves_while_the_picture_does_not(tmp_path: Path, inspect: Inspect, noise: float) -> None:
     path = write(tmp_path / "r", shown(held(20, 28), noise=noise), state=True)

@@ -32,6 +32,7 @@ SAME_REAL = (
     "queries.points=8",
     "observer.remove_outliers={neighbors: 12, std_ratio: 3.0}",
     "observer.remove_table={min_share: 0.95, trials: 50}",
+    "quality.max_median_sigma_m=0.1",  # the default then
 )
 
 

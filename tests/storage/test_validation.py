@@ -331,7 +331,8 @@ def jumping(e: Episode, points: int, meters: float = 0.5) -> Episode:
 def hidden(e: Episode, points: int, source: PositionSource) -> Episode:
     visible = e.tracks.visible.copy()
     visible[20:, :points] = False
-    return changed_quality(replace(e, tracks=replace(e.tracks, visible=visible)), source=np.where(visible, 1, source))
+    unseen = replace(e, tracks=replace(e.tracks, visible=visible))
+    return changed_quality(unseen, source=np.where(visible, 1, source), sight=np.where(visible, 0, 1))
 
 
 def at(t: int, m: int, value: object, elsewhere: object) -> np.ndarray:
@@ -355,6 +356,14 @@ ESTIMATED_HARMS: dict[str, tuple[Callable[[Episode], Episode], str]] = {
     "measured without depth": (
         lambda e: changed_quality(e, depth_valid=at(1, 1, False, True)),
         "depth_valid: point 1 at step 1 is measured",
+    ),
+    "sight of nothing": (
+        lambda e: changed_quality(e, sight=at(4, 3, 5, 0)),
+        "sight: point 3 at step 4 has a sight that",
+    ),
+    "visible, yet covered": (
+        lambda e: changed_quality(e, sight=at(4, 3, 1, 0)),
+        "sight: point 3 at step 4 has a sight",
     ),
     "negative distance": (
         lambda e: changed_quality(e, disagreement=at(2, 2, -0.5, 0.1)),

@@ -254,9 +254,9 @@ def test_wide_pictures_keep_their_size_and_odd_ones_become_even(
 
 def test_one_frame_is_enough(episode: Episode, tmp_path: Path) -> None:
     names = ["time_s", "point_cloud", "point_count", "state", "action", "success", "rgb", "depth"]
-    quality = replace(
-        episode.tracks.quality, **{k: getattr(episode.tracks.quality, k)[:1] for k in episode.tracks.quality.__slots__}
-    )
+    known = episode.tracks.quality
+    first = {k: values[:1] for k in known.__slots__ if (values := getattr(known, k)) is not None}
+    quality = replace(known, **first)
     tracks = replace(
         episode.tracks, xyz_world=episode.tracks.xyz_world[:1], visible=episode.tracks.visible[:1], quality=quality
     )

@@ -15,8 +15,9 @@ class QualityStage(Stage):
     """A position counts as sure if the camera sees the point and its stated error is below this [m]."""
     min_sure_share: float = Field(default=0.25, ge=0, le=1)
     """Share of all positions, over points and frames, that must be sure."""
-    max_median_sigma_m: float = Field(default=0.1, gt=0)
-    """Median stated error of visible points [m] that is still good enough."""
+    max_median_sigma_m: float = Field(default=0.05, gt=0)
+    """Median stated error of visible points [m] that is still good enough: labels of which half may be farther off are
+    not to be trusted."""
     max_lost_share: float = Field(default=0.8, ge=0, le=1)
     """Share of the points that may be lost for good, that is, not visible in the last tenth of the episode."""
 

@@ -1,6 +1,6 @@
 """The rigid-body tracker against scenes whose motion is known in closed form."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import moving_planes
 import numpy as np
@@ -165,3 +165,16 @@ def test_same_seed_same_tracks() -> None:
 
 def test_keeps_the_contract_of_trackers() -> None:
     check_tracker(RigidBodies)
+
+
+@pytest.mark.parametrize("pixels", [[(21, 31)], [(21, 31), (22, 30)]])
+def test_hardly_any_depth_is_no_reason_to_stop(pixels: list[tuple[int, int]]) -> None:
+    """Not even where none of it lies at a pixel that is looked at for bodies."""
+    clip, _ = moving_planes.film([moving_planes.wall(1.0, 6)], 80, 60)
+    depth = np.zeros_like(clip.depth)
+    for x, y in pixels:
+        depth[:, y, x] = 1
+    _, labels = label_clip(
+        replace(clip, depth=depth), np.array(pixels, np.float32), RigidBodies(), ChunkSettings(), LiftSettings()
+    )
+    np.testing.assert_allclose(labels.xyz_world[-1], labels.xyz_world[0], atol=0.01)

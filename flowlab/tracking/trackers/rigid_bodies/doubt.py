@@ -10,17 +10,19 @@ from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 EVIDENCE = (
     "1", "surroundings", "body", "other motions around", "still", "spread", "apart", "apart, expected", "undecided",
 )  # fmt: skip
 """What doubt is told from, see :func:`evidence`."""
-WEIGHTS = (-6.95, 4.39, 0.92, 3.34, 1.94, 0.12, 0.40, -0.02, 0.45)
-"""Log-odds per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py``."""
+WEIGHTS = (-7.38, 4.65, 1.93, 3.50, 2.18, 0.15, 0.40, -0.02, 0.30)
+"""Log-odds per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py`` as of commit ee6b5f3."""
 FAR_M = 0.02
 """An error beyond this is far."""
 _CELLS, _NEAR = 3000, 12
 """Cells at least that speak for the whole picture, and how many of them are a point's surroundings."""
+_FRAMES_AT_ONCE = 128
 _UNSEEN_COST = 0.6
 """What a cell counts that is not seen where its motion takes it."""
 
@@ -86,13 +88,18 @@ def _fit_of_cells(
     fit: RigidBodyFit, motion: np.ndarray, pixels: np.ndarray, xyz: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """How badly every frame fits cells (T, n) where their motions take them, and whether they are seen there."""
-    pictures, path = fit.pictures, np.empty((len(fit.pictures), len(xyz), 3))
-    for k, m in enumerate(fit.motions):
-        path[:, motion == k] = m.apply(xyz[motion == k])
-    uv, z = pictures.project(path), path[..., 2]
+    pictures = fit.pictures
     features = _costs.features_at(pictures.feature[0], pixels)
-    cost = _costs.residuals(pictures.depth, pictures.feature, features, uv, z)
-    return cost, _surfaces.is_seen(pictures.depth, uv, z) & (cost >= 0)
+    cost, seen = np.empty((len(pictures), len(xyz)), np.float32), np.empty((len(pictures), len(xyz)), bool)
+    for first in range(0, len(pictures), _FRAMES_AT_ONCE):
+        now = slice(first, first + _FRAMES_AT_ONCE)
+        path = np.empty((len(pictures.depth[now]), len(xyz), 3))
+        for k, m in enumerate(fit.motions):
+            path[:, motion == k] = RigidMotion(m.R[now], m.t[now]).apply(xyz[motion == k])
+        uv, z = pictures.project(path), path[..., 2]
+        cost[now] = _costs.residuals(pictures.depth[now], pictures.feature[now], features, uv, z)
+        seen[now] = _surfaces.is_seen(pictures.depth[now], uv, z) & (cost[now] >= 0)
+    return cost, seen
 
 
 def _fit_of_motions(cost: np.ndarray, seen: np.ndarray, motion: np.ndarray, motions: int) -> np.ndarray:

@@ -91,7 +91,7 @@ class FittedPoints:
 def fit_points(
     clip: Clip, xy: Float[np.ndarray, "N 2"], followed: Tracks2D, options: RigidBodies
 ) -> FittedPoints | None:
-    """Fit bodies to a clip, and carry points of its first frame; None where it is too short or no point has depth.
+    """Fit bodies to a clip, and carry points of its first frame; None where it is too short, or has too little depth.
 
     Args:
         clip: The pictures.
@@ -105,6 +105,8 @@ def fit_points(
         return None
     pictures = extract_features(clip, options.max_depth)
     fit, uv = fit_bodies(pictures, options.seed), pictures.from_clip_pixels(xy[deep])
+    if not fit.grid.valid.any():
+        return None
     carried = propagate(fit, uv, z[deep])
     lifted = lift(clip, followed, LiftSettings())
     other = doubt.SecondOpinion(
