@@ -12,7 +12,7 @@ from trained_runs import SMALL, make_rolls, make_run
 
 from flowlab.checksums import with_checksum
 from flowlab.errors import DataError, UsageError
-from flowlab.policies.checkpoint import read_trained
+from flowlab.policies.checkpoint import FREE, read_trained
 from flowlab.registry import REGISTRIES, Registry, names_from_file
 
 Capture = pytest.CaptureFixture[str]
@@ -106,7 +106,7 @@ def test_a_strangers_run_imports_nothing(run: Path, installed: Path, tmp_path: P
     for policy in (PLACES[0], "dp3"):
         about["policy"]["settings"]["policy"] = policy
         (tmp_path / "run/policy.json").write_text(json.dumps(with_checksum(about)))
-        (tmp_path / "run/run.json").write_text(json.dumps(with_checksum(plan, ("dataset",))))
+        (tmp_path / "run/run.json").write_text(json.dumps(with_checksum(plan, FREE)))
         for command in (
             ("train", tmp_path / "run", "--resume"),
             ("eval", tmp_path / "run"),

@@ -15,6 +15,9 @@ from flowlab.data.training_settings import TrainSettings
 from flowlab.data.window_sampler import WindowIndex
 from flowlab.errors import UsageError
 
+_HALF_WEIGHT = 0.5
+"""Stated error of an inferred action, as a share of what its number varies by, at which its weight is a half."""
+
 
 class BatchBuilder:
     """Makes batches of windows that hold what a policy needs, and nothing else.
@@ -32,7 +35,7 @@ class BatchBuilder:
         self._start = np.array([e.start for e in buffer.episodes])
         self._stop = np.array([e.stop for e in buffer.episodes])
         self._center = buffer.state[:, channels.gripper].mean(0) if channels.gripper else np.zeros(3)
-        self._action_weight = action_weight(buffer, settings)
+        self._action_weight = action_weight(buffer)
         self._queries = np.zeros((len(buffer.episodes), 0), int)
         self._weight = np.zeros((len(buffer.state), 0), np.float32)
         if needs.flow is not None:
@@ -138,11 +141,11 @@ class BatchBuilder:
         return flow, _mean_one(sure * known[..., None])
 
 
-def action_weight(buffer: ReplayBuffer, settings: TrainSettings) -> Float32[np.ndarray, "F A"] | None:
+def action_weight(buffer: ReplayBuffer) -> Float32[np.ndarray, "F A"] | None:
     """How much every number of every action counts, by its stated error; None where none was inferred."""
     if buffer.action_sigma is None or not buffer.action_sigma.any():
         return None
-    half = settings.batch.action_sigma * np.maximum(buffer.action.std(0), 1e-6)
+    half = _HALF_WEIGHT * np.maximum(buffer.action.std(0), 1e-6)
     return (1 / (1 + (buffer.action_sigma / half) ** 2)).astype(np.float32)
 
 

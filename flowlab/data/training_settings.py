@@ -27,8 +27,6 @@ class BatchSettings(Settings):
     turn_deg: float = Field(default=20.0, ge=0, le=180)
     """Turn scene and robot together about the vertical by up to so much, at random [degrees]: only where all of the
     state is positions and the action is a position or a displacement, as in simulation."""
-    action_sigma: PositiveFloat = 0.5
-    """Stated error of an inferred action, as a share of what its number varies by, at which its weight is a half."""
     pad: bool = False
     """Train on the steps before the start and after the end of a demonstration too, which repeat its first and last
     action, as DP3 does; else they have no weight."""

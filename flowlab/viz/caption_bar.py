@@ -16,7 +16,16 @@ from flowlab.text import cut
 from flowlab.viz.captions import role_name, tracker_name
 from flowlab.viz.colors import PREDICTED_RGB, role_rgb
 from flowlab.viz.plot_style import label_text, plain_style
-from flowlab.viz.stated_error import COARSE_M, SIGMA_NAMES, SIGMA_RGB, class_shares, percent, shares_below, stated_sigma
+from flowlab.viz.stated_error import (
+    COARSE_M,
+    MOST_DRAWN_M,
+    SIGMA_NAMES,
+    SIGMA_RGB,
+    class_shares,
+    percent,
+    shares_below,
+    stated_sigma,
+)
 
 _DPI = 128
 """A power of two, so that sizes in inches are whole pixels."""
@@ -103,7 +112,7 @@ class CaptionBar:
         if self._sigma is not None:
             self._dot(x, "o", _INK, _INK, size=5)
             self._dot(x, "o", "none", _INK, size=13, edge_width=1)
-            words = f"radius of the circle: σ, from {1000 * COARSE_M:.0f} mm on"
+            words = f"radius of the circle: σ, {1000 * COARSE_M:.0f} to {1000 * MOST_DRAWN_M:.0f} mm"
             self._write(x + 13, _LEGEND_Y, words, size=11, color=_QUIET)
         if predicted:
             self._draw_path(x - 6)

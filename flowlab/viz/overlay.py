@@ -7,7 +7,7 @@ from flowlab.records import Episode, FlowPrediction, PositionSource
 from flowlab.viz.colors import PREDICTED_RGB, track_rgb
 from flowlab.viz.orientation import is_upside_down, project_upright
 from flowlab.viz.plan_predictions import PlanPrediction, plan_predictions
-from flowlab.viz.stated_error import is_coarse, stated_sigma
+from flowlab.viz.stated_error import MOST_DRAWN_M, is_coarse, stated_sigma
 
 _RIM = (16, 18, 22)
 """Around every mark, so that it shows on any picture."""
@@ -88,7 +88,7 @@ class Overlay:
         episode, scale = self._episode, self._scale
         xyz_world = episode.tracks.xyz_world[:, : episode.queries.count]
         z = np.stack([episode.camera_at(t).project(row)[1] for t, row in enumerate(xyz_world)])
-        radius = sigma * episode.camera.K[0, 0] * scale / np.maximum(z, 1e-6)
+        radius = np.minimum(sigma, MOST_DRAWN_M) * episode.camera.K[0, 0] * scale / np.maximum(z, 1e-6)
         return np.nan_to_num(radius, nan=np.inf).clip(0, 2 * scale * episode.camera.width)
 
     def _draw_prediction(self, canvas: UInt8[np.ndarray, "H W 3"], plan: PlanPrediction, t: int) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, UInt8
 from flowlab.records import Episode
 from flowlab.viz.blueprint import scene_size
 from flowlab.viz.colors import track_rgb
-from flowlab.viz.stated_error import is_coarse, sigma_rgb, stated_sigma
+from flowlab.viz.stated_error import MOST_DRAWN_M, is_coarse, sigma_rgb, stated_sigma
 
 TRAIL_STEPS = 20
 """A trail shows where a point was over this many steps."""
@@ -49,7 +49,7 @@ def send_errors(recording: rr.RecordingStream, episode: Episode) -> None:
         return
     centers, radius = episode.tracks.xyz_world[:, : episode.queries.count][large], sigma[large]
     spheres = rr.Ellipsoids3D.columns(
-        centers=centers, half_sizes=np.repeat(radius[:, None], 3, 1), colors=sigma_rgb(radius)
+        centers=centers, half_sizes=np.repeat(np.minimum(radius, MOST_DRAWN_M)[:, None], 3, 1), colors=sigma_rgb(radius)
     )
     recording.send_columns("/world/tracks/errors", time_columns(episode), spheres.partition(large.sum(1)))
     style = rr.Ellipsoids3D.from_fields(fill_mode="majorwireframe", line_radii=0.0004 * scene_size(episode))

@@ -12,6 +12,8 @@ SIGMA_RGB = ((128, 246, 231), (229, 204, 28), (242, 134, 8), (228, 44, 50), (150
 SIGMA_NAMES = ("< 5 mm", "< 10 mm", "< 20 mm", "< 50 mm", "≥ 50 mm")
 COARSE_M = 0.02
 """What is stated from here on [m] is drawn as unsure: with faint trails, and a circle of radius σ around the mark."""
+MOST_DRAWN_M = 0.05
+"""Circles are drawn no larger than this [m]: what may be farther off is off anywhere, and would hide the rest."""
 _PALETTE = np.array(SIGMA_RGB, np.uint8)
 
 

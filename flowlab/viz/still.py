@@ -28,7 +28,7 @@ from flowlab.viz.panels import (
     two_panels,
 )
 from flowlab.viz.plot_style import ALARM, INK, QUIET, label_text, plain_style, save_png, set_heading
-from flowlab.viz.stated_error import COARSE_M, stated_sigma
+from flowlab.viz.stated_error import COARSE_M, MOST_DRAWN_M, stated_sigma
 
 TRAILS_PER_ROLE = 24
 """More trails than this hide each other."""
@@ -134,7 +134,9 @@ def _draw_estimated_trails(
     drawn, visible = _drawn_trails(episode), episode.tracks.visible
     for k in drawn:
         axes.add_collection(error_trail(tracks[:, k], sigma[:, k], visible[:, k]), autolim=False)
-    draw_error_circles(axes, tracks[-1, drawn], sigma[-1, drawn] * unit[drawn], sigma[-1, drawn])
+    draw_error_circles(
+        axes, tracks[-1, drawn], np.minimum(sigma[-1, drawn], MOST_DRAWN_M) * unit[drawn], sigma[-1, drawn]
+    )
     (start_u, start_v), (end_u, end_v) = tracks[0, drawn].T, tracks[-1, drawn].T
     axes.scatter(start_u, start_v, 10, c="white", edgecolors=QUIET, linewidths=0.8, zorder=5)
     seen, ink = visible[-1, drawn], error_color(sigma[-1, drawn])
@@ -157,6 +159,6 @@ def _draw_legend(figure: Figure, episode: Episode) -> None:
         draw_legend(figure, [*role_dots(episode), dot("start", "white", QUIET), dot("end", TIME_COLORS(1.0), "none")])
         return
     marks = [dot("start", "white", QUIET), dot("end", INK, "none"), dot("end, out of sight", "white", INK)]
-    circle = dot(f"radius σ ≥ {1000 * COARSE_M:.0f} mm", "none", INK)
+    circle = dot(f"radius σ, {1000 * COARSE_M:.0f} to {1000 * MOST_DRAWN_M:.0f} mm", "none", INK)
     circle.set_markersize(11)
     draw_legend(figure, [*error_legend(sigma), *marks, circle], bottom=0.06)

@@ -17,6 +17,7 @@ from flowlab.checksums import with_checksum
 from flowlab.evaluation.episode_log import append_result
 from flowlab.evaluation.results import EpisodeResult
 from flowlab.evaluation.validation import validate_run
+from flowlab.policies.checkpoint import FREE
 
 Capture = pytest.CaptureFixture[str]
 OLD = Path(__file__).parents[1] / "fixtures/old/runs"
@@ -76,7 +77,7 @@ def spoil(path: Path) -> None:
 
 def rewrite(path: Path, **changes: object) -> None:
     values = {k: v for k, v in json.loads(path.read_text()).items() if k != "sha256"}
-    path.write_text(json.dumps(with_checksum({**values, **changes}, ("dataset",) if path.name == "run.json" else ())))
+    path.write_text(json.dumps(with_checksum({**values, **changes}, FREE if path.name == "run.json" else ())))
 
 
 PROBLEMS: dict[str, tuple[Callable[[Path], object], str]] = {

@@ -441,7 +441,7 @@ def test_stills_of_recordings_show_the_error(real: Episode, tmp_path: Path) -> N
     figure = plot_still(real, "pour")
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts[:5] == ["σ < 5 mm: 20%", "< 10 mm: 20%", "< 20 mm: 20%", "< 50 mm: 80%", "≥ 50 mm: 20%"]
-    assert texts[5:] == ["start", "end", "end, out of sight", "radius σ ≥ 20 mm"]
+    assert texts[5:] == ["start", "end", "end, out of sight", "radius σ, 20 to 50 mm"]
     np.testing.assert_allclose([bar.get_height() for bar in figure.axes[2].patches], [0.2, 0, 0, 0.6, 0.2])
 
 
@@ -466,7 +466,7 @@ def test_trails_of_recordings_are_colored_by_error_and_faint_where_it_is_large(r
 
 def test_large_stated_errors_are_spheres_in_the_recording(real: Episode, tmp_path: Path) -> None:
     half_sizes = recorded(real, tmp_path)["/world/tracks/errors", "Ellipsoids3D:half_sizes"]
-    np.testing.assert_allclose(half_sizes[0], np.repeat([[0.06], [0.02], [0.02], [0.02]], 3, axis=1))
+    np.testing.assert_allclose(half_sizes[0], np.repeat([[0.05], [0.02], [0.02], [0.02]], 3, axis=1))
     exact = replace(real, tracks=replace(real.tracks, quality=None))
     assert ("/world/tracks/errors", "Ellipsoids3D:half_sizes") not in recorded(exact, tmp_path)
 
