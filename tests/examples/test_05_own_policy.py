@@ -71,7 +71,11 @@ def test_it_keeps_the_promises_of_a_policy(check: Callable[..., None], policy: t
     check(policy, SMALL)
 
 
-@pytest.mark.slow  # color pictures by llvmpipe, episode after episode; tests/evaluation/test_color_policy.py has one
+SLOW = pytest.mark.slow
+"""Color pictures by llvmpipe, episode after episode; tests/evaluation/test_color_policy.py has one."""
+
+
+@SLOW
 def test_it_is_evaluated_in_simulation(run: Path) -> None:
     done = flowlab("eval", run, "--episodes", 2, "--seeds", 0, "--workers", 1, "--json")
     assert done.returncode == 0, done.stderr
@@ -80,6 +84,7 @@ def test_it_is_evaluated_in_simulation(run: Path) -> None:
     assert [(t["task"], t.get("note", "")) for t in tried] == [("plate-slide", "")] * 2
 
 
+@SLOW
 def test_it_drives_a_robot_by_color(run: Path, data: Path, policy: type[PolicyNetwork]) -> None:
     driver, episode = Policy.load(run), Dataset(data).episode(0)
     assert isinstance(driver.network, policy)
@@ -97,6 +102,7 @@ def test_it_drives_a_robot_by_color(run: Path, data: Path, policy: type[PolicyNe
         act(None)
 
 
+@SLOW
 def test_where_its_module_is_not_found_a_run_says_so(run: Path) -> None:
     command = [sys.executable, "-m", "flowlab", "eval", run, "--episodes", "1"]
     environment = {k: v for k, v in ENVIRONMENT.items() if k != "PYTHONPATH"}
