@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from flowlab.actions.robot import GripperPath
@@ -64,7 +64,7 @@ def refine_path(found: GripperPath, tracks: Tracks3D) -> RefinedPath:
 
 def _on_gripper(
     local: Float[np.ndarray, "T M 3"], known: Bool[np.ndarray, "T M"], found: GripperPath
-) -> Float[np.ndarray, "n"]:
+) -> Int[np.ndarray, "n"]:
     """The tracks that stay where they are on the gripper while it moves."""
     enough = known.sum(0) >= max(5, 0.3 * len(found))
     way = float(np.quantile(np.linalg.norm(found.position - np.median(found.position, 0), axis=1), 0.7))
@@ -80,8 +80,7 @@ def _on_gripper(
 
 def _follow(path: GripperPath, xyz: np.ndarray, weight: np.ndarray) -> GripperPath:
     """The poses that take the places of tracks on the gripper to where they are."""
-    local = np.stack([path.to_gripper(xyz[k], k) for k in range(len(path))])
-    place = np.stack([_median(local[weight[:, m] > 0, m]) for m in range(xyz.shape[1])])
+    _, place = _on_it(path, xyz, weight)
     position, R = path.position.copy(), None if path.R is None else path.R.copy()
     for k, w in enumerate(weight):
         if not w.any():
@@ -95,8 +94,11 @@ def _follow(path: GripperPath, xyz: np.ndarray, weight: np.ndarray) -> GripperPa
     return GripperPath(position, R)
 
 
-def _median(values: np.ndarray) -> np.ndarray:
-    return np.median(values, 0) if len(values) else np.zeros(3)
+def _on_it(path: GripperPath, xyz: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where tracks are on the gripper in every frame (T, n, 3), and the median of where they are seen (n, 3) [m]."""
+    local = np.stack([path.to_gripper(xyz[k], k) for k in range(len(path))])
+    seen = [local[weight[:, m] > 0, m] for m in range(xyz.shape[1])]
+    return local, np.stack([np.median(x, 0) if len(x) else np.zeros(3) for x in seen])
 
 
 def _is_broad(place: np.ndarray) -> bool:
@@ -129,8 +131,7 @@ def smooth(values: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
 
 
 def _with_spread(path: GripperPath, found: GripperPath, xyz: np.ndarray, weight: np.ndarray) -> RefinedPath:
-    local = np.stack([path.to_gripper(xyz[k], k) for k in range(len(path))])
-    place = np.stack([_median(local[weight[:, m] > 0, m]) for m in range(xyz.shape[1])])
+    local, place = _on_it(path, xyz, weight)
     off = np.linalg.norm(local - place, axis=2)
     total = weight.sum(1)
     mean = (off * weight).sum(1) / np.maximum(total, 1e-9)
