@@ -5,7 +5,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 LONG := OMP_NUM_THREADS=1 nice -n 10 $(BIN)/flowlab bench --workers 1 --device cpu
 unexport PYTHONDONTWRITEBYTECODE # images set it; each of the hundreds of processes would compile all that it imports
 
-.PHONY: demo test test-all openpi campaigns lint format house docs wheel benchmark table1 ablations clean help
+.PHONY: demo test test-all openpi ray campaigns lint format house docs wheel benchmark table1 ablations clean help
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -24,6 +24,10 @@ openpi: .venv/test ## the real openpi-client drives a served policy, in an envir
 	test -d .venv-openpi || $(PYTHON) -m venv .venv-openpi
 	.venv-openpi/bin/python -m pip --disable-pip-version-check -q install openpi-client==0.1.2 typing_extensions ./client # it imports the second without asking for it
 	FLOWLAB_OPENPI=.venv-openpi/bin/python $(BIN)/pytest tests/serving/test_openpi_client.py
+
+ray: .venv/test ## a Ray cluster of two machines makes a dataset, and one of them is killed; needs a machine that is not busy
+	$(PIP) install -c constraints.txt ray
+	FLOWLAB_RAY=1 $(BIN)/pytest tests/pipeline/test_ray_engine.py
 
 CAMPAIGN ?= --budget 1200
 campaigns: .venv/test ## kill, flip, fuzz, attack, disk: hours; see docs/reliability.md. CAMPAIGN="--seed 7 --count 50"

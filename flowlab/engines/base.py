@@ -14,6 +14,16 @@ from flowlab.registry import ENGINES
 Unit = TypeVar("Unit")
 Receipt = TypeVar("Receipt")
 
+WORKER_ENVIRONMENT = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "LP_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "MALLOC_ARENA_MAX",
+)
+"""All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
+
 
 @dataclass(frozen=True, slots=True)
 class UnitResult(Generic[Unit, Receipt]):
@@ -39,6 +49,11 @@ class Engine(ABC, Generic[Unit, Receipt]):
 
     def __init__(self, work: Callable[[Unit], Receipt], *, workers: int, imports: Sequence[str] = ()) -> None:
         self.work, self.workers, self.imports = work, workers, tuple(imports)
+
+    @classmethod
+    def default_workers(cls) -> int:
+        """How many units to run at a time if nobody says; the default is one for each core of this machine."""
+        return core_count()
 
     def __enter__(self) -> Self:
         """Begin; the default has nothing to do."""
@@ -77,12 +92,14 @@ def engine_by_name(
     """What makes an engine of that name, or at that import path.
 
     Args:
-        name: ``local``, or another that ``flowlab plugins`` lists, or ``module:Class``.
-        workers: How many units to run at a time; None for one for each core of this machine.
+        name: ``local``, ``ray``, or another that ``flowlab plugins`` lists, or ``module:Class``.
+        workers: How many units to run at a time; None for what the engine takes by default.
         imports: Modules that a worker will need.
 
     Raises:
         UsageError: There is no such engine, or fewer than one worker.
     """
     engine: Any = ENGINES.load(name)
-    return partial(engine, workers=check_optional_count(workers, "workers") or core_count(), imports=imports)
+    return partial(
+        engine, workers=check_optional_count(workers, "workers") or engine.default_workers(), imports=imports
+    )

@@ -16,20 +16,9 @@ from typing import Any, Self
 
 from pebble import ProcessExpired, ProcessPool
 
-from flowlab.engines.base import Engine, Receipt, Unit, UnitResult
+from flowlab.engines.base import WORKER_ENVIRONMENT, Engine, Receipt, Unit, UnitResult
 from flowlab.errors import FlowlabError
 from flowlab.files import is_running
-
-_WORKER_ENVIRONMENT = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "LP_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-    "MALLOC_ARENA_MAX",
-)
-"""All set to 1: a worker is one core's work, and memory pools for more threads would only lie idle."""
-
 
 _STARTING = threading.Lock()
 """The pool starts workers from threads of its own."""
@@ -87,7 +76,7 @@ class LocalEngine(Engine[Unit, Receipt]):
         self._tries: dict[Future[Receipt], tuple[Unit, int]] = {}
 
     def __enter__(self) -> Self:
-        for name in _WORKER_ENVIRONMENT:
+        for name in WORKER_ENVIRONMENT:
             os.environ.setdefault(name, "1")
         # Workers are forked from a clean process that has imported everything once, and share its memory.
         context = _OwnProgramContext()

@@ -21,6 +21,8 @@ from flowlab.storage.repair import forget_damaged
 
 _LOG = logging.getLogger(__name__)
 _SECONDS_BETWEEN_SUMMARIES = 5.0
+_AHEAD = 4
+"""So many units for each worker are under way, or the plan is asked for more."""
 
 
 def engine_for(recipe: Recipe, engine: str, workers: int | None) -> StartEngine[WorkUnit, Receipt]:
@@ -108,17 +110,23 @@ def run_all(
     share: JobShard,
     report: Callable[[ExtractionProgress], None],
 ) -> list[UnitResult[WorkUnit, Receipt]]:
-    """Submit units and collect outcomes until nothing is left that this run could do; returns the failures."""
+    """Submit units and collect outcomes until nothing is left that this run could do; returns the failures.
+
+    The plan is asked again only when what it gave before is nearly done, and the books are summed up the less often the
+    longer that takes: both look at all that there is, and a run of many units would do little else.
+    """
     receipts = _receipts_by_unit(folder)
     under_way: dict[str, WorkUnit] = {}
     failures: list[UnitResult[WorkUnit, Receipt]] = []
-    next_summary = time.monotonic() + _SECONDS_BETWEEN_SUMMARIES
+    tell = _Seldom(lambda: report(plan.progress(receipts.values())), least_seconds=0.0)
+    sum_up = _Seldom(lambda: summarize(folder), least_seconds=_SECONDS_BETWEEN_SUMMARIES)
     while True:
-        taken = [*under_way.values(), *(f.unit for f in failures)]
-        for unit in plan.next_units(receipts.values(), taken, share):
-            under_way[unit.name] = unit
-            engine.submit(unit)
-        report(plan.progress(receipts.values()))
+        if len(under_way) < _AHEAD * engine.workers:
+            taken = [*under_way.values(), *(f.unit for f in failures)]
+            for unit in plan.next_units(receipts.values(), taken, share):
+                under_way[unit.name] = unit
+                engine.submit(unit)
+        tell(at_once=not under_way)
         if not under_way:
             seen, receipts = receipts.keys(), _receipts_by_unit(folder)
             if receipts.keys() == seen:  # otherwise jobs beside this one went on: is there more to do now?
@@ -129,11 +137,34 @@ def run_all(
         if outcome.receipt is None:
             failures.append(outcome)
         else:
+            _check_shared(folder, outcome.unit)
             receipts[outcome.unit.name] = outcome.receipt
-        if time.monotonic() > next_summary:
-            start = time.monotonic()
-            summarize(folder)
-            next_summary = time.monotonic() + max(_SECONDS_BETWEEN_SUMMARIES, 20 * (time.monotonic() - start))
+        sum_up()
+
+
+class _Seldom:
+    """Does something whose cost grows with what there is, so seldom that it takes a twentieth of the time at most."""
+
+    def __init__(self, work: Callable[[], object], least_seconds: float) -> None:
+        self._work, self._least = work, least_seconds
+        self._next = time.monotonic() + least_seconds
+
+    def __call__(self, at_once: bool = False) -> None:
+        """Do it if it is time to, or ``at_once``."""
+        start = time.monotonic()
+        if at_once or start >= self._next:
+            self._work()
+            end = time.monotonic()
+            self._next = end + max(self._least, 20 * (end - start))
+
+
+def _check_shared(folder: Path, unit: WorkUnit) -> None:
+    """Refuse a folder that workers on other machines do not share with this one: nothing they make would be found."""
+    if not (folder / "receipts" / f"{unit.name}.json").exists():
+        raise DataError(
+            f"{folder}: a worker says that it made {unit.name}, but its receipt is not here; --out must be a folder "
+            f"that all machines of the engine share, at the same path"
+        )
 
 
 def _receipts_by_unit(folder: Path) -> dict[str, Receipt]:

@@ -49,6 +49,8 @@ def recipe() -> Recipe:
 class InThisProcess:
     """Does the units here, one after the other."""
 
+    workers = 1
+
     def __init__(self, work: Callable[[WorkUnit], Receipt]) -> None:
         self.work, self.units = work, list[WorkUnit]()
 

@@ -3,7 +3,7 @@
 import random
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,6 +55,8 @@ class World:
 
 class RandomEngine:
     """Brings units to their end in random order; at ``cut_off`` of them the run dies, some of its units done."""
+
+    workers = 1
 
     def __init__(self, world: World, share: int, pause: Callable[[], None], cut_off: int | None) -> None:
         self.world, self.share, self.pause, self.left = world, share, pause, cut_off
@@ -239,6 +241,24 @@ def test_units_given_up_are_not_tried_again_in_the_same_run(tmp_path: Path) -> N
     engine = RandomEngine(world, 0, lambda: None, None)
     assert run_all(engine, SeedScheduler({"push": 5}, 0), tmp_path, JobShard(), lambda _: None) == []
     check_seeds(world, {"push": 5}, 0)
+
+
+def test_a_plan_is_not_asked_again_while_enough_is_under_way(tmp_path: Path) -> None:
+    """Or planning, which looks at all that is done, would take the square of the time."""
+    (tmp_path / "receipts").mkdir()
+    world = World(tmp_path, lambda _, s: s % 7 > 0, random.Random(0))
+    asked = []
+
+    class Plan(SeedScheduler):
+        def next_units(self, *args: object) -> Iterable[WorkUnit]:
+            asked.append(1)
+            return super().next_units(*args)
+
+    engine = RandomEngine(world, 0, lambda: None, None)
+    assert run_all(engine, Plan({"push": 400}, 0), tmp_path, JobShard(), lambda _: None) == []
+    check_seeds(world, {"push": 400}, 0)
+    assert len(world.tried) > 400
+    assert len(asked) < 20
 
 
 def test_the_first_round_is_cut_the_same_for_every_share() -> None:
