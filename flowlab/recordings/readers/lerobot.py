@@ -63,7 +63,7 @@ class LeRobotReader:
         stamps = _stamps(one, numbers)
         time_s = np.ascontiguousarray(numbers.get(TIME, np.arange(last - first) / one.info.fps).reshape(-1), np.float64)
         color, depth = (read_pictures(one, f, first, time_s, stamps) for f in (camera.color, camera.depth))
-        timing = Timing("timestamp")
+        timing = Timing("the timestamps")
         state, action = (_stream(one, name, numbers, time_s, timing) for name in (STATE, ACTION))
         unread = _unread(one, (camera.color.name, camera.depth.name))
         return Streams(

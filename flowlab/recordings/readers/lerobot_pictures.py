@@ -86,7 +86,7 @@ def read_pictures(one: LeRobotEpisode, feature: LeRobotFeature, first: int, time
         DataError: The video is missing, too short, or has other pictures than the feature.
     """
     names = tuple(f"{feature.name}[{k}]" for k in range(len(time_s)))
-    timing = Timing("timestamp")
+    timing = Timing("the timestamps")
     code = depth_code(one, feature) if feature.is_depth and feature.dtype == "video" else None
     if feature.dtype == "image":
         read = partial(_depth_image if feature.is_depth else _color_image, one.data, feature.name, first)
