@@ -116,9 +116,9 @@ def _stamps(one: LeRobotEpisode, numbers: dict[str, np.ndarray]) -> Float64[np.n
         said = numbers.get(name)
         if said is None:
             continue
-        off = np.abs(said.reshape(-1).astype(np.float64) / per_s - expected)
+        off = np.abs(said.reshape(-1).astype(np.float64) / per_s - expected) if said.size == one.length else expected
         if said.size != one.length or off.max() > NEAREST / one.info.fps:
-            k = int(np.argmax(off)) if said.size == one.length else 0
+            k = int(np.argmax(off > NEAREST / one.info.fps)) if said.size == one.length else 0
             raise DataError(f"{one.data}: {name} is {shown(said.reshape(-1)[k].item())} in step {k} of {one.where.name}, and at "
                             f"{one.info.fps:g} pictures a second it would be {expected[k] * per_s:.6g}")  # fmt: skip
     return expected

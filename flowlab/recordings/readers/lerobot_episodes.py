@@ -90,7 +90,7 @@ def _read(folder: Path, state: tuple[Any, ...]) -> Mapping[str, LeRobotEpisode]:
         index = _whole(place, row, "episode_index")
         if index in found:
             raise DataError(f"{place}: has the episode {index} twice")
-        length = _whole(place, row, "length")
+        length = _whole(place, row, "length", 1 << 62)
         if not 0 < length <= MAX_FILES:
             raise DataError(f"{place}: says the episode {index} has {length:,} steps, expected 1 to {MAX_FILES:,}")
         found[index] = LeRobotEpisode(info, index, length, _texts(row.get("tasks"), texts), row)
@@ -146,9 +146,9 @@ def _json_lines(file: Path) -> Iterator[dict[str, Any]]:
             yield row
 
 
-def _whole(place: Path, said: Mapping[str, Any], key: str) -> int:
+def _whole(place: Path, said: Mapping[str, Any], key: str, most: int = 10**9) -> int:
     value = said.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 10**9:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < most:
         raise DataError(f"{place}: {key} is {shown(value)}, expected a whole number from 0 on")
     return value
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flowlab.errors import DataError, first_line
-from flowlab.limits import MAX_FILES, MAX_LOADED_BYTES, MAX_PICTURE_BYTES, MAX_PIXELS, MAX_TABLE_ROWS
+from flowlab.limits import MAX_FILES, MAX_LOADED_BYTES, MAX_PICTURE_BYTES, MAX_PIXELS, MAX_TABLE_ROWS, MAX_TEXT_BYTES
 from flowlab.text import shown
 
 _KEPT = 4
@@ -71,7 +71,7 @@ class ParquetTables:
         key = _state(path)
         if key not in self._opened:
             try:
-                file = pq.ParquetFile(path, thrift_string_size_limit=MAX_LOADED_BYTES)
+                file = pq.ParquetFile(path, thrift_string_size_limit=MAX_TEXT_BYTES)
             except (pa.ArrowException, OSError, ValueError) as error:
                 raise DataError(f"{path}: is no readable Parquet file ({first_line(error)}); copy it again") from error
             if file.metadata.num_rows > MAX_TABLE_ROWS or file.metadata.num_row_groups > MAX_FILES:
@@ -107,7 +107,7 @@ class ParquetTables:
         for group in groups:
             chunks = (about.row_group(group).column(k) for k in range(about.num_columns))
             size += sum(max(c.total_uncompressed_size, 8 * c.num_values if "." in c.path_in_schema else 0)
-                        for c in chunks if c.path_in_schema.startswith(tuple(names)))  # fmt: skip
+                        for c in chunks if any(f"{c.path_in_schema}.".startswith(f"{n}.") for n in names))  # fmt: skip
         if size > MAX_LOADED_BYTES:
             raise DataError(f"{path}: {shown(names[0])} unpacks to {size:,} bytes, expected at most {MAX_LOADED_BYTES:,}")
         try:
