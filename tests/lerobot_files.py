@@ -31,7 +31,11 @@ def write_video(path: Path, pictures: np.ndarray, fps: int = FPS, codec: str | N
         stream = container.add_stream(codec or ("libx265" if deep else "libx264"), rate=fps)
         stream.width, stream.height = pictures.shape[2], pictures.shape[1]
         stream.pix_fmt = "gray12le" if deep else "yuv444p"
-        stream.options = {"x265-params": "lossless=1:log-level=none:bframes=0", "preset": "ultrafast"} if deep else {"crf": "4", "bf": "0", "g": "2"}
+        stream.options = (
+            {"x265-params": "lossless=1:log-level=none:bframes=0", "preset": "ultrafast"}
+            if deep
+            else {"crf": "4", "bf": "0", "g": "2"}
+        )
         for k, picture in enumerate(pictures):
             if deep:
                 frame = av.VideoFrame(picture.shape[1], picture.shape[0], "gray12le")
@@ -58,8 +62,18 @@ def feature(dtype: str, shape: list[int], names: Any = None, **info: Any) -> dic
 
 def features(color: str, depth: str, camera: dict[str, Any] | None) -> dict[str, Any]:
     size, about = [SIZE[1], SIZE[0]], {} if camera is None else {"camera": camera}
-    kind = {"png": {"depth_unit": "mm"}, "tiff": {"depth_unit": "m"}, "video": {f"video.{k}": v for k, v in CODE.items()}}[depth]
-    own = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+    kind = {
+        "png": {"depth_unit": "mm"},
+        "tiff": {"depth_unit": "m"},
+        "video": {f"video.{k}": v for k, v in CODE.items()},
+    }[depth]
+    own = {
+        "timestamp": "float32",
+        "frame_index": "int64",
+        "episode_index": "int64",
+        "index": "int64",
+        "task_index": "int64",
+    }
     return {
         "observation.state": feature("float32", [9], {"motors": [f"joint_{k}" for k in range(9)]}),
         "action": feature("float32", [9]),
@@ -71,11 +85,15 @@ def features(color: str, depth: str, camera: dict[str, Any] | None) -> dict[str,
 
 def columns(k: int, color: str, depth: str, first: int = 0) -> dict[str, Any]:
     seen = filmed(k)
-    own = {"observation.state": pa.array(seen.state.tolist(), pa.list_(pa.float32())),
-           "action": pa.array(seen.action.tolist(), pa.list_(pa.float32())),
-           "timestamp": pa.array(np.arange(STEPS, dtype=np.float32) / FPS), "frame_index": pa.array(range(STEPS)),
-           "episode_index": pa.array([k] * STEPS), "index": pa.array(range(first, first + STEPS)),
-           "task_index": pa.array([k] * STEPS)}  # fmt: skip
+    own = {
+        "observation.state": pa.array(seen.state.tolist(), pa.list_(pa.float32())),
+        "action": pa.array(seen.action.tolist(), pa.list_(pa.float32())),
+        "timestamp": pa.array(np.arange(STEPS, dtype=np.float32) / FPS),
+        "frame_index": pa.array(range(STEPS)),
+        "episode_index": pa.array([k] * STEPS),
+        "index": pa.array(range(first, first + STEPS)),
+        "task_index": pa.array([k] * STEPS),
+    }
     if color != "video":
         own[COLOR] = embedded(seen.rgb, ".png")
     if depth != "video":
@@ -83,10 +101,22 @@ def columns(k: int, color: str, depth: str, first: int = 0) -> dict[str, Any]:
     return own
 
 
-def write_info(folder: Path, version: str, demos: int, color: str, depth: str, camera: Any, paths: list[str], **changed: Any) -> None:
-    info = {"codebase_version": version, "robot_type": "arm", "total_episodes": demos, "total_frames": demos * STEPS, "total_tasks": demos,
-            "chunks_size": 1000, "fps": FPS, "splits": {"train": f"0:{demos}"}, "data_path": paths[0], "video_path": paths[1],
-            "features": features(color, depth, camera)}  # fmt: skip
+def write_info(
+    folder: Path, version: str, demos: int, color: str, depth: str, camera: Any, paths: list[str], **changed: Any
+) -> None:
+    info = {
+        "codebase_version": version,
+        "robot_type": "arm",
+        "total_episodes": demos,
+        "total_frames": demos * STEPS,
+        "total_tasks": demos,
+        "chunks_size": 1000,
+        "fps": FPS,
+        "splits": {"train": f"0:{demos}"},
+        "data_path": paths[0],
+        "video_path": paths[1],
+        "features": features(color, depth, camera),
+    }
     (folder / "meta").mkdir(parents=True, exist_ok=True)
     (folder / "meta/info.json").write_text(json.dumps(info | changed))
 
@@ -99,23 +129,36 @@ def of(k: int, what: str) -> np.ndarray:
     return filmed(k).rgb if what == "rgb" else codes(filmed(k).depth)
 
 
-def v3(folder: Path, demos: int = 2, color: str = "video", depth: str = "png", camera: Any = CAMERA, **changed: Any) -> Path:
+def v3(
+    folder: Path, demos: int = 2, color: str = "video", depth: str = "png", camera: Any = CAMERA, **changed: Any
+) -> Path:
     """All episodes in one table, and in one video for each camera."""
-    paths = ["data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-             "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"]  # fmt: skip
+    paths = [
+        "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+    ]
     write_info(folder, "v3.0", demos, color, depth, camera, paths, **changed)
     tables = [pa.table(columns(k, color, depth, k * STEPS)) for k in range(demos)]
     (folder / "data/chunk-000").mkdir(parents=True)
     pq.write_table(pa.concat_tables(tables), folder / "data/chunk-000/file-000.parquet")
     rows: dict[str, Any] = {
-        "episode_index": list(range(demos)), "tasks": [[f"{TASK} {k}"] for k in range(demos)], "length": [STEPS] * demos,
-        "data/chunk_index": [0] * demos, "data/file_index": [0] * demos, "success": [k == 0 for k in range(demos)],
-    }  # fmt: skip
+        "episode_index": list(range(demos)),
+        "tasks": [[f"{TASK} {k}"] for k in range(demos)],
+        "length": [STEPS] * demos,
+        "data/chunk_index": [0] * demos,
+        "data/file_index": [0] * demos,
+        "success": [k == 0 for k in range(demos)],
+    }
     for name, what in videos(color, depth).items():
-        write_video(folder / f"videos/{name}/chunk-000/file-000.mp4", np.concatenate([of(k, what) for k in range(demos)]))
-        of_video = {"chunk_index": [0] * demos, "file_index": [0] * demos,
-                    "from_timestamp": [k * STEPS / FPS for k in range(demos)],
-                    "to_timestamp": [(k + 1) * STEPS / FPS for k in range(demos)]}  # fmt: skip
+        write_video(
+            folder / f"videos/{name}/chunk-000/file-000.mp4", np.concatenate([of(k, what) for k in range(demos)])
+        )
+        of_video = {
+            "chunk_index": [0] * demos,
+            "file_index": [0] * demos,
+            "from_timestamp": [k * STEPS / FPS for k in range(demos)],
+            "to_timestamp": [(k + 1) * STEPS / FPS for k in range(demos)],
+        }
         rows |= {f"videos/{name}/{key}": values for key, values in of_video.items()}
     (folder / "meta/episodes/chunk-000").mkdir(parents=True)
     pq.write_table(pa.table(rows), folder / "meta/episodes/chunk-000/file-000.parquet")
@@ -124,17 +167,23 @@ def v3(folder: Path, demos: int = 2, color: str = "video", depth: str = "png", c
     return folder
 
 
-def v21(folder: Path, demos: int = 2, color: str = "video", depth: str = "png", camera: Any = CAMERA, **changed: Any) -> Path:
+def v21(
+    folder: Path, demos: int = 2, color: str = "video", depth: str = "png", camera: Any = CAMERA, **changed: Any
+) -> Path:
     """A table and a video for each episode; episodes and tasks line by line."""
-    paths = ["data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-             "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"]  # fmt: skip
+    paths = [
+        "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    ]
     write_info(folder, "v2.1", demos, color, depth, camera, paths, **changed)
     (folder / "data/chunk-000").mkdir(parents=True)
     for k in range(demos):
         pq.write_table(pa.table(columns(k, color, depth)), folder / f"data/chunk-000/episode_{k:06d}.parquet")
         for name, what in videos(color, depth).items():
             write_video(folder / f"videos/chunk-000/{name}/episode_{k:06d}.mp4", of(k, what))
-    episodes = [{"episode_index": k, "tasks": [f"{TASK} {k}"], "length": STEPS, "success": k == 0} for k in range(demos)]
+    episodes = [
+        {"episode_index": k, "tasks": [f"{TASK} {k}"], "length": STEPS, "success": k == 0} for k in range(demos)
+    ]
     tasks = [{"task_index": k, "task": f"{TASK} {k}"} for k in range(demos)]
     for name, rows in (("episodes", episodes), ("tasks", tasks)):
         (folder / f"meta/{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))

@@ -16,10 +16,10 @@ from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler
 from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.pipeline.units import JobShard, WorkUnit
+from flowlab.recordings.base import DatasetReader, choose_reader
 from flowlab.recordings.identity import difference, identity
 from flowlab.recordings.parsing import files_of_metadata
 from flowlab.recordings.parts import split_path
-from flowlab.recordings.base import DatasetReader, choose_reader
 from flowlab.recordings.recording import RecordingSettings, find_recordings
 from flowlab.recordings.recording_yaml import load_metadata
 from flowlab.storage.dataset import Dataset

@@ -22,8 +22,14 @@ from flowlab.recordings.recording import find_recordings
 
 Capture = pytest.CaptureFixture[str]
 Write = Callable[..., Path]
-HALF = K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-LAYOUTS = [(v3, "video", "png"), (v3, "png", "video"), (v3, "png", "tiff"), (v21, "video", "video"), (v21, "png", "png")]
+HALF = K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+LAYOUTS = [
+    (v3, "video", "png"),
+    (v3, "png", "video"),
+    (v3, "png", "tiff"),
+    (v21, "video", "video"),
+    (v21, "png", "png"),
+]
 NAMES = [f"{w.__name__}, color {c}, depth {d}" for w, c, d in LAYOUTS]
 
 
@@ -80,7 +86,11 @@ def edit_table(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 CALIBRATIONS: dict[str, tuple[Any, dict[str, Any], list[str]]] = {
     "pixel centers at a half": ({**CAMERA, "K": HALF.tolist(), "pixel_centers": 0.5}, {}, []),
-    "axes of OpenGL": ({**CAMERA, "T_world_cam": (POSE @ np.diag([1.0, -1, -1, 1])).tolist(), "axes": "opengl"}, {}, []),
+    "axes of OpenGL": (
+        {**CAMERA, "T_world_cam": (POSE @ np.diag([1.0, -1, -1, 1])).tolist(), "axes": "opengl"},
+        {},
+        [],
+    ),
     "recording.yaml": (None, {"intrinsics": GIVEN, "T_world_cam": POSE.tolist()}, []),
     "--calibration": (None, {}, ["--calibration", "cam.yaml"]),
 }
@@ -150,7 +160,10 @@ def test_a_depth_feature_is_told_by_its_old_mark_and_its_unit_by_its_type(tmp_pa
     path = v21(tmp_path / "d", demos=1, color="png")
     edit_json(path / "meta/info.json", lambda i: i["features"][DEPTH].update(info={"video.is_depth_map": True}))
     run = dry_run(capsys, path)
-    assert (run.code, run.checks["depth unit"][0]) == (0, "assumed" if "custom" in run.checks["depth unit"][1] else "ok")
+    assert (run.code, run.checks["depth unit"][0]) == (
+        0,
+        "assumed" if "custom" in run.checks["depth unit"][1] else "ok",
+    )
     assert run.facts["depth_unit_m"] == 0.001
 
 

@@ -19,9 +19,16 @@ def main(folder: str, out: str) -> None:
     windows = {f"window/{n}": np.asarray(window[n]) for n in steps}
     stats = {f"stats/{n}/{k}": np.asarray(v) for n, s in dataset.meta.stats.items() for k, v in s.items()}
     solved = [bool(e["success"]) for e in dataset.meta.episodes]
-    camera = {f"camera/{n}": np.asarray(f["info"]["camera"]["K"]) for n, f in dataset.meta.features.items() if "camera" in f.get("info", {})}
+    camera = {
+        f"camera/{n}": np.asarray(f["info"]["camera"]["K"])
+        for n, f in dataset.meta.features.items()
+        if "camera" in f.get("info", {})
+    }
     np.savez(out, version=lerobot.__version__, **values, task=tasks, success=solved, **windows, **stats, **camera)
-    print(f"LeRobot {lerobot.__version__} opens {Path(folder).name}: {dataset.num_episodes} episodes, {len(dataset)} steps")
+    print(
+        f"LeRobot {lerobot.__version__} opens {Path(folder).name}: {dataset.num_episodes} episodes, "
+        f"{len(dataset)} steps"
+    )
     for name, rows in values.items():
         print(f"  {name} {rows.dtype} {rows.shape[1:]}")
 

@@ -27,16 +27,28 @@ HOW: dict[str, dict[str, Any]] = {
 def test_lerobot_opens_it(how: str, tmp_path: Path) -> None:
     made: list[Episode] = [episode(0, "lift"), episode(0)]
     LeRobotExporter(**HOW[how]).export(make_dataset(tmp_path / "d", [made[:1], made[1:]]), tmp_path / "x")
-    env = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "HF_LEROBOT_HOME": str(tmp_path / "hf/lerobot"),
-           "CUDA_VISIBLE_DEVICES": ""}  # fmt: skip
+    env = {
+        **os.environ,
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": str(tmp_path / "hf"),
+        "HF_LEROBOT_HOME": str(tmp_path / "hf/lerobot"),
+        "CUDA_VISIBLE_DEVICES": "",
+    }
     script = Path(__file__).with_name("open_with_lerobot.py")
-    done = subprocess.run([PYTHON, script, tmp_path / "x", tmp_path / "out.npz"], env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [PYTHON, script, tmp_path / "x", tmp_path / "out.npz"], env=env, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     print(done.stdout)
     found = np.load(tmp_path / "out.npz")
-    every = {"observation.state": [e.state for e in made], "action": [e.action for e in made],
-             "observation.point_cloud": [e.point_cloud for e in made], "observation.tracks": [e.tracks.xyz_world for e in made],
-             "observation.tracks_visible": [e.tracks.visible for e in made], "next.success": [e.success for e in made]}  # fmt: skip
+    every = {
+        "observation.state": [e.state for e in made],
+        "action": [e.action for e in made],
+        "observation.point_cloud": [e.point_cloud for e in made],
+        "observation.tracks": [e.tracks.xyz_world for e in made],
+        "observation.tracks_visible": [e.tracks.visible for e in made],
+        "next.success": [e.success for e in made],
+    }
     for name, values in every.items():
         rows = np.concatenate(values)
         np.testing.assert_array_equal(found[name].reshape(rows.shape), rows, name)
@@ -50,5 +62,7 @@ def test_lerobot_opens_it(how: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(seen[depth > 0], depth[depth > 0], atol=3e-3 if how == "all videos" else 1e-3)
     np.testing.assert_array_equal(found["window/action"], made[0].action[1:5])
     np.testing.assert_array_equal(found["window/observation.point_cloud"].reshape(2, -1, 3), made[0].point_cloud[:2])
-    np.testing.assert_allclose(found["stats/observation.state/mean"], np.concatenate([e.state for e in made]).mean(0), atol=1e-5)
+    np.testing.assert_allclose(
+        found["stats/observation.state/mean"], np.concatenate([e.state for e in made]).mean(0), atol=1e-5
+    )
     np.testing.assert_array_equal(found[f"camera/{COLOR}"], made[0].camera.K)

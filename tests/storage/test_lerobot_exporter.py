@@ -20,8 +20,8 @@ from synthetic import call_cli, make_dataset, make_episode, make_provenance, wit
 
 from flowlab.geometry.camera import Camera
 from flowlab.provenance import Channels
-from flowlab.records import Episode
 from flowlab.recordings.parsing import RecordingSettings, parse_recording
+from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.lerobot import LeRobotExporter
 from flowlab.testing.exporters import CHECKS, MakeExporter
@@ -39,7 +39,9 @@ def episode(seed: int, task: str = TASK, **changed: Any) -> Episode:
     seen = filmed(seed)
     made = with_quality(make_episode(seed, task=task, steps=STEPS))
     depth = (seen.mm / 1000).astype(np.float32)
-    return replace(made, camera=CAMERA, rgb=seen.rgb, depth=depth, state=seen.state, extras={"source": f"take-{seed}"}, **changed)
+    return replace(
+        made, camera=CAMERA, rgb=seen.rgb, depth=depth, state=seen.state, extras={"source": f"take-{seed}"}, **changed
+    )
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,9 @@ def info(path: Path) -> dict[str, Any]:
 
 def table(path: Path) -> dict[str, np.ndarray]:
     read = pq.read_table(path / "data/chunk-000/file-000.parquet")
-    return {n: np.array(read.column(n).to_pylist()) for n in read.column_names if not n.startswith("observation.images")}
+    return {
+        n: np.array(read.column(n).to_pylist()) for n in read.column_names if not n.startswith("observation.images")
+    }
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -80,7 +84,12 @@ def test_every_promise_is_kept(check: Callable[[MakeExporter, Dataset], None], d
 
 def test_the_schema_is_that_of_lerobot(exported: Path) -> None:
     said = info(exported)
-    assert (said["codebase_version"], said["fps"], said["total_episodes"], said["total_frames"]) == ("v3.0", FPS, 3, 3 * STEPS)
+    assert (said["codebase_version"], said["fps"], said["total_episodes"], said["total_frames"]) == (
+        "v3.0",
+        FPS,
+        3,
+        3 * STEPS,
+    )
     assert (said["total_tasks"], said["splits"], type(said["fps"])) == (2, {"train": "0:3"}, int)
     features = said["features"]
     file = pq.ParquetFile(exported / "data/chunk-000/file-000.parquet")
@@ -115,12 +124,18 @@ def test_parquet_is_written_as_measured(exported: Path) -> None:
 
 def test_numbers_are_those_of_the_dataset(exported: Path, made: list[Episode]) -> None:
     found, steps = table(exported), np.arange(3 * STEPS)
-    np.testing.assert_array_equal(found["observation.point_cloud"].astype(np.float32), np.concatenate([e.point_cloud for e in made]))
-    np.testing.assert_array_equal(found["observation.tracks"].astype(np.float32), np.concatenate([e.tracks.xyz_world for e in made]))
+    np.testing.assert_array_equal(
+        found["observation.point_cloud"].astype(np.float32), np.concatenate([e.point_cloud for e in made])
+    )
+    np.testing.assert_array_equal(
+        found["observation.tracks"].astype(np.float32), np.concatenate([e.tracks.xyz_world for e in made])
+    )
     np.testing.assert_array_equal(found["observation.tracks_visible"], np.concatenate([e.tracks.visible for e in made]))
     sigma = np.concatenate([e.tracks.quality.sigma for e in made])  # type: ignore[union-attr]
     np.testing.assert_array_equal(found["observation.tracks_sigma"].astype(np.float32), sigma)
-    np.testing.assert_array_equal(found["observation.state"].astype(np.float32), np.concatenate([e.state for e in made]))
+    np.testing.assert_array_equal(
+        found["observation.state"].astype(np.float32), np.concatenate([e.state for e in made])
+    )
     np.testing.assert_array_equal(found["action"].astype(np.float32), np.concatenate([e.action for e in made]))
     np.testing.assert_array_equal(found["next.success"], np.concatenate([e.success for e in made]))
     np.testing.assert_array_equal(found["index"], steps)
@@ -192,7 +207,9 @@ def test_color_is_a_video_with_a_frame_for_each_step(exported: Path, made: list[
 
 
 @pytest.mark.parametrize(("how", "unit"), [("mm", 0.001), ("m", 1.0)])
-def test_depth_images_are_without_loss(how: Any, unit: float, dataset: Dataset, made: list[Episode], tmp_path: Path) -> None:
+def test_depth_images_are_without_loss(
+    how: Any, unit: float, dataset: Dataset, made: list[Episode], tmp_path: Path
+) -> None:
     LeRobotExporter(depth=how, rgb="image").export(dataset, tmp_path / "x", "lift")
     about = info(tmp_path / "x")["features"][DEPTH]
     assert (about["dtype"], about["info"]["is_depth_map"], about["info"]["depth_unit"]) == ("image", True, how)
@@ -205,7 +222,9 @@ def test_depth_images_are_without_loss(how: Any, unit: float, dataset: Dataset, 
         counts = np.asarray(Image.open(io.BytesIO(depth[t]["bytes"])))
         np.testing.assert_allclose(counts * unit, made[0].depth[t], atol=1e-7)
         assert how == "mm" or np.array_equal(counts, made[0].depth[t])
-        np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(rgb[t]["bytes"], np.uint8), 1)[..., ::-1], made[0].rgb[t])
+        np.testing.assert_array_equal(
+            cv2.imdecode(np.frombuffer(rgb[t]["bytes"], np.uint8), 1)[..., ::-1], made[0].rgb[t]
+        )
 
 
 def test_depth_on_request_is_lerobots_video(dataset: Dataset, made: list[Episode], tmp_path: Path) -> None:
@@ -223,7 +242,9 @@ def test_depth_on_request_is_lerobots_video(dataset: Dataset, made: list[Episode
 def test_flat_is_one_row_of_numbers(dataset: Dataset, made: list[Episode], tmp_path: Path) -> None:
     LeRobotExporter(flat=True).export(dataset, tmp_path / "x", "lift")
     assert info(tmp_path / "x")["features"]["observation.tracks"]["shape"] == [24]
-    np.testing.assert_array_equal(table(tmp_path / "x")["observation.tracks"].astype(np.float32).reshape(STEPS, 8, 3), made[0].tracks.xyz_world)
+    np.testing.assert_array_equal(
+        table(tmp_path / "x")["observation.tracks"].astype(np.float32).reshape(STEPS, 8, 3), made[0].tracks.xyz_world
+    )
 
 
 def test_what_a_dataset_lacks_is_not_made_up(tmp_path: Path, capsys: Capture, caplog: pytest.LogCaptureFixture) -> None:
@@ -243,7 +264,9 @@ def test_a_camera_that_moves_is_written_step_by_step(tmp_path: Path) -> None:
     poses[:, 0, 3] += 0.02 * np.arange(STEPS)
     still, moving = episode(1), replace(episode(0), T_world_cam=poses)
     LeRobotExporter(rgb="image").export(make_dataset(tmp_path / "d", [[moving], [still]]), tmp_path / "x")
-    np.testing.assert_array_equal(table(tmp_path / "x")["observation.T_world_cam"], np.concatenate([poses, np.tile(POSE, (STEPS, 1, 1))]))
+    np.testing.assert_array_equal(
+        table(tmp_path / "x")["observation.T_world_cam"], np.concatenate([poses, np.tile(POSE, (STEPS, 1, 1))])
+    )
     assert "camera" not in info(tmp_path / "x")["features"][COLOR]["info"], "what differs is told by episode"
     moves, stands = (parse_recording(tmp_path / f"x/episode_{k}", RecordingSettings()) for k in range(2))
     assert moves.streams.poses is not None
@@ -259,15 +282,25 @@ def test_pictures_of_two_sizes_are_refused(tmp_path: Path, capsys: Capture) -> N
     assert not (tmp_path / "x").exists()
 
 
-def test_what_was_exported_is_labeled_as_a_recording(dataset: Dataset, exported: Path, made: list[Episode], tmp_path: Path, capsys: Capture) -> None:
+def test_what_was_exported_is_labeled_as_a_recording(
+    dataset: Dataset, exported: Path, made: list[Episode], tmp_path: Path, capsys: Capture
+) -> None:
     """Geometry, robot, task and success come back through the command line."""
-    code, said, _ = call_cli(capsys, "export", dataset.path, "--to", "lerobot", "--out", tmp_path / "x", "--set", "rgb=image")
+    code, said, _ = call_cli(
+        capsys, "export", dataset.path, "--to", "lerobot", "--out", tmp_path / "x", "--set", "rgb=image"
+    )
     assert (code, said) == (0, f"3 episodes written to {tmp_path / 'x'} for lerobot\n")
     run = dry_run(capsys, tmp_path / "x/episode_1")
     assert (run.code, run.problem) == (0, "None")
     for about in ("layout", "intrinsics", "registration", "world", "camera", "depth unit", "clock"):
         assert run.checks[about][0] == "ok", run.checks[about]
-    small = ("observer.points=256", "queries.points=40", "quality.min_sure_share=0", "quality.max_median_sigma_m=9", "write.rgb=true")
+    small = (
+        "observer.points=256",
+        "queries.points=40",
+        "quality.min_sure_share=0",
+        "quality.max_median_sigma_m=9",
+        "write.rgb=true",
+    )
     how = ("--tracker", "lucas-kanade", "--workers", "1", *(word for change in small for word in ("--set", change)))
     for _ in range(2):
         code, _, err = call_cli(capsys, "track-real", tmp_path / "x/episode_1", "--out", tmp_path / "y", *how)

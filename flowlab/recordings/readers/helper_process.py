@@ -85,7 +85,9 @@ _REFUSED: dict[tuple[str, int], str] = {}
 """Files on which a library hangs or crashes, by path and time of change: none is waited for twice."""
 
 
-def ask_of_file(serve: str, path: Path, changed: int, what: str, arguments: tuple[Any, ...], *, words: FileWords) -> Any:
+def ask_of_file(
+    serve: str, path: Path, changed: int, what: str, arguments: tuple[Any, ...], *, words: FileWords
+) -> Any:
     """What the other process says of a file.
 
     Args:

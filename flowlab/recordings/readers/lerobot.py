@@ -13,7 +13,13 @@ from flowlab.recordings.base import SampleStream, Streams
 from flowlab.recordings.parts import split_path
 from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.readers.lerobot_camera import choose_camera, is_registered, known_calibration
-from flowlab.recordings.readers.lerobot_episodes import LeRobotEpisode, is_dataset, meta_files, one_episode, read_episodes
+from flowlab.recordings.readers.lerobot_episodes import (
+    LeRobotEpisode,
+    is_dataset,
+    meta_files,
+    one_episode,
+    read_episodes,
+)
 from flowlab.recordings.readers.lerobot_pictures import NEAREST, picture_files, read_pictures
 from flowlab.recordings.readers.lerobot_process import ask
 from flowlab.recordings.recording_yaml import Metadata
@@ -89,7 +95,9 @@ def _rows(one: LeRobotEpisode) -> tuple[int, int]:
         index = np.full(ask(one.data, "count"), one.index)
     rows = np.flatnonzero(index.reshape(-1) == one.index)
     if len(rows) != one.length:
-        raise DataError(f"{one.data}: has {len(rows):,} rows of {one.where.name}, and meta/ says it has {one.length:,} steps")
+        raise DataError(
+            f"{one.data}: has {len(rows):,} rows of {one.where.name}, and meta/ says it has {one.length:,} steps"
+        )
     if rows[-1] - rows[0] + 1 != len(rows):
         raise DataError(f"{one.data}: has rows of other episodes between those of {one.where.name}")
     return int(rows[0]), int(rows[-1]) + 1
@@ -110,7 +118,7 @@ def _numbers(one: LeRobotEpisode, first: int, last: int) -> dict[str, np.ndarray
 
 
 def _stamps(one: LeRobotEpisode, numbers: dict[str, np.ndarray]) -> Float64[np.ndarray, "N"]:
-    """Where every step is in the video of its episode: its number over the rate, with which ``timestamp`` must agree."""
+    """Where every step is in the video of its episode: its number over the rate; ``timestamp`` must agree."""
     expected = np.arange(one.length) / one.info.fps
     for name, per_s in (("timestamp", 1.0), ("frame_index", one.info.fps)):
         said = numbers.get(name)
@@ -119,12 +127,15 @@ def _stamps(one: LeRobotEpisode, numbers: dict[str, np.ndarray]) -> Float64[np.n
         off = np.abs(said.reshape(-1).astype(np.float64) / per_s - expected) if said.size == one.length else expected
         if said.size != one.length or off.max() > NEAREST / one.info.fps:
             k = int(np.argmax(off > NEAREST / one.info.fps)) if said.size == one.length else 0
-            raise DataError(f"{one.data}: {name} is {shown(said.reshape(-1)[k].item())} in step {k} of {one.where.name}, and at "
+            found = shown(said.reshape(-1)[k].item())
+            raise DataError(f"{one.data}: {name} is {found} in step {k} of {one.where.name}, and at "
                             f"{one.info.fps:g} pictures a second it would be {expected[k] * per_s:.6g}")  # fmt: skip
     return expected
 
 
-def _stream(one: LeRobotEpisode, name: str, numbers: dict[str, np.ndarray], time_s: np.ndarray, timing: Timing) -> tuple[SampleStream, ...]:
+def _stream(
+    one: LeRobotEpisode, name: str, numbers: dict[str, np.ndarray], time_s: np.ndarray, timing: Timing
+) -> tuple[SampleStream, ...]:
     """The robot's numbers; nothing where there are none."""
     values, feature = numbers.get(name), one.info.features.get(name)
     if values is None or feature is None:
@@ -137,7 +148,9 @@ def _stream(one: LeRobotEpisode, name: str, numbers: dict[str, np.ndarray], time
     return (SampleStream(name, time_s, rows, timing, columns=feature.names),)
 
 
-def _poses(one: LeRobotEpisode, numbers: dict[str, np.ndarray], time_s: np.ndarray, timing: Timing) -> SampleStream | None:
+def _poses(
+    one: LeRobotEpisode, numbers: dict[str, np.ndarray], time_s: np.ndarray, timing: Timing
+) -> SampleStream | None:
     """Where a camera was that moves."""
     if POSES not in numbers:
         return None

@@ -48,20 +48,24 @@ def choose_camera(one: LeRobotEpisode, named: str | None) -> LeRobotCamera:
     where = f"{one.info.folder}: is a LeRobot dataset"
     if not colors or not depths:
         what = some_of([shown(f.name)[1:-1] for f in pictures]) or "none"
-        raise DataError(f"{where} without {'depth' if colors else 'color'} pictures (its pictures are {what}), and flowlab needs "
-                        "both; record it with a depth camera, or mark the feature with info: {is_depth_map: true}")  # fmt: skip
+        raise DataError(f"{where} without {'depth' if colors else 'color'} pictures (its pictures are {what}), and "
+                        "flowlab needs both; record it with a depth camera, or mark the feature with info: "
+                        "{is_depth_map: true}")  # fmt: skip
     pairs, guessed = _pairs(colors, depths)
     names = {_short(color): (color, depth) for color, depth in pairs}
     if not names:
-        raise DataError(f"{where} whose depth ({some_of([f.name for f in depths])}) belongs to none of its color pictures by its "
-                        f"name ({some_of([f.name for f in colors])}); call it as those, with '_depth' at the end")  # fmt: skip
+        found, others = (some_of([f.name for f in features]) for features in (depths, colors))
+        raise DataError(f"{where} whose depth ({found}) belongs to none of its color pictures by its name ({others}); "
+                        "call it as those, with '_depth' at the end")  # fmt: skip
     still = [n for n in names if not IN_HAND.search(n)] or list(names)
     wanted = named if named is None else next((n for n, (c, _) in names.items() if named in (n, c.name)), "")
     if wanted == "":
-        raise DataError(f"{where} whose cameras with depth are {some_of(list(names))}, and 'camera' says {shown(named)}")
+        raise DataError(
+            f"{where} whose cameras with depth are {some_of(list(names))}, and 'camera' says {shown(named)}"
+        )
     if wanted is None and len(still) > 1:
-        raise DataError(f"{where} with several cameras, {some_of(list(names))}; choose one with 'camera: {still[0]}' in "
-                        f"{one.info.folder / FILE_NAME} (or the calibration file)")  # fmt: skip
+        raise DataError(f"{where} with several cameras, {some_of(list(names))}; choose one with "
+                        f"'camera: {still[0]}' in {one.info.folder / FILE_NAME} (or the calibration file)")  # fmt: skip
     color, depth = names[wanted or still[0]]
     return LeRobotCamera(color, depth, tuple(_told(one, names, color, depth, wanted, guessed)))
 
@@ -132,7 +136,9 @@ def _pose(where: str, T: Any, about: Mapping[str, Any]) -> list[list[float]]:
     """A pose of a camera with the axes of OpenCV."""
     axes = about.get("axes", "opencv")
     if axes not in _AXES:
-        raise DataError(f"{where}.axes is {shown(axes)}, expected opencv (x right, y down, z forward) or opengl (x right, y up)")
+        raise DataError(
+            f"{where}.axes is {shown(axes)}, expected opencv (x right, y down, z forward) or opengl (x right, y up)"
+        )
     found: list[list[float]] = (check_poses(f"{where}.T_world_cam", _matrix(f"{where}.T_world_cam", T, (4, 4))[None])[0]
                                 * np.array(_AXES[axes], float)).tolist()  # fmt: skip
     return found

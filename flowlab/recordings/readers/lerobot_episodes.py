@@ -48,7 +48,9 @@ class LeRobotEpisode:
         path = self._file(self.info.video_path, f"videos/{feature}/", video_key=feature)
         start = self.said.get(f"videos/{feature}/from_timestamp", 0.0 if not self.info.is_v3 else None)
         if isinstance(start, bool) or not isinstance(start, int | float) or not 0 <= start < 1e8:
-            raise DataError(f"{self.where}: videos/{shown(feature)[1:-1]}/from_timestamp is {shown(start)}, expected seconds")
+            raise DataError(
+                f"{self.where}: videos/{shown(feature)[1:-1]}/from_timestamp is {shown(start)}, expected seconds"
+            )
         return path, float(start)
 
     def _file(self, template: str, of: str, **values: str) -> Path:
@@ -76,7 +78,12 @@ def read_episodes(folder: Path) -> Mapping[str, LeRobotEpisode]:
 def meta_files(folder: Path) -> list[Path]:
     """The files that say something of episodes and tasks."""
     wanted = [folder / name for name in (FOLDER_INDEX, *_TASKS, *_EPISODES)]
-    return [found.path for place in wanted for found in files_below(place) if found.path.suffix in (".json", ".jsonl", ".parquet")]
+    return [
+        found.path
+        for place in wanted
+        for found in files_below(place)
+        if found.path.suffix in (".json", ".jsonl", ".parquet")
+    ]
 
 
 @lru_cache(maxsize=4)
@@ -96,7 +103,10 @@ def _read(folder: Path, state: tuple[Any, ...]) -> Mapping[str, LeRobotEpisode]:
         found[index] = LeRobotEpisode(info, index, length, _texts(row.get("tasks"), texts), row)
     if info.total_episodes is not None and info.total_episodes != len(found):
         told = _EPISODES[0 if info.is_v3 else 1]
-        raise DataError(f"{info.place}: says there are {info.total_episodes:,} episodes, and {told} has {len(found):,}; copy it again")
+        raise DataError(
+            f"{info.place}: says there are {info.total_episodes:,} episodes, and {told} has {len(found):,}; "
+            "copy it again"
+        )
     return {f"{_CALLED}{k:06d}": found[k] for k in sorted(found)}
 
 
@@ -106,7 +116,9 @@ def _rows(info: LeRobotInfo, files: Sequence[Path]) -> Iterator[tuple[Path, dict
                                  else f.name == "episodes.jsonl")]  # fmt: skip
     if not told:
         name = f"{_EPISODES[0]}/*/*.parquet" if info.is_v3 else _EPISODES[1]
-        raise DataError(f"{info.folder}: has no {name}, where a dataset of {info.version} tells of its episodes; copy it again")
+        raise DataError(
+            f"{info.folder}: has no {name}, where a dataset of {info.version} tells of its episodes; copy it again"
+        )
     for file in told:
         for row in _parquet_rows(file) if info.is_v3 else _json_lines(file):
             yield file, row
@@ -183,5 +195,3 @@ def is_dataset(folder: Path) -> bool:
         return "codebase_version" in parse_json(read_text(folder / FOLDER_INDEX, 1 << 24), "")
     except (DataError, TypeError, OSError, ValueError):
         return False
-
-

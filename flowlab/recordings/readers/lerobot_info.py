@@ -84,7 +84,9 @@ class LeRobotInfo:
         def value(found: re.Match[str]) -> str:
             name, width = found.groups()
             if name not in values:
-                raise DataError(f"{self.place}: the path {shown(template)} has '{{{name}}}', expected {', '.join(values)}")
+                raise DataError(
+                    f"{self.place}: the path {shown(template)} has '{{{name}}}', expected {', '.join(values)}"
+                )
             return f"{values[name]:0{width}d}" if width and isinstance(values[name], int) else str(values[name])
 
         name = _FIELD.sub(value, template)
@@ -117,7 +119,9 @@ def read_info(folder: Path) -> LeRobotInfo:
     features = said.get("features")
     if not isinstance(features, dict) or not features:
         raise DataError(f"{place}: features is {shown(features)}, expected a mapping of names to dtype and shape")
-    data, video = (said.get(key) or usual for key, usual in zip(("data_path", "video_path"), _PATHS[major], strict=True))
+    data, video = (
+        said.get(key) or usual for key, usual in zip(("data_path", "video_path"), _PATHS[major], strict=True)
+    )
     for key, path in (("data_path", data), ("video_path", video)):
         if not isinstance(path, str):
             raise DataError(f"{place}: {key} is {shown(path)}, expected a path as {_PATHS[major][0]}")
@@ -137,7 +141,9 @@ def _whole(place: Path, said: Mapping[str, Any], key: str, usual: int) -> int:
 def _feature(place: Path, name: str, about: Any) -> LeRobotFeature:
     """A feature whose shape can be. Raises :class:`DataError`."""
     if not isinstance(about, dict) or not isinstance(about.get("dtype"), str):
-        raise DataError(f"{place}: the feature {shown(name)} is {shown(about)}, expected a mapping with dtype and shape")
+        raise DataError(
+            f"{place}: the feature {shown(name)} is {shown(about)}, expected a mapping with dtype and shape"
+        )
     shape, dtype = about.get("shape") or (), about["dtype"]
     if not isinstance(shape, list | tuple) or not all(type(n) is int and n >= 0 for n in shape):
         raise DataError(f"{place}: the feature {shown(name)} has the shape {shown(shape)}, expected whole numbers")
@@ -146,9 +152,13 @@ def _feature(place: Path, name: str, about: Any) -> LeRobotFeature:
         product *= n
     most = 4 * MAX_PIXELS if dtype in ("image", "video") else 1000 * MAX_WIDTH
     if product > most:
-        raise DataError(f"{place}: the feature {shown(name)} has the shape {shown(shape)}, expected at most {most:,} numbers")
+        raise DataError(
+            f"{place}: the feature {shown(name)} has the shape {shown(shape)}, expected at most {most:,} numbers"
+        )
     info = about.get("info") or about.get("video_info") or {}
-    return LeRobotFeature(name, dtype, tuple(shape), _names(about.get("names"), shape), info if isinstance(info, dict) else {})
+    return LeRobotFeature(
+        name, dtype, tuple(shape), _names(about.get("names"), shape), info if isinstance(info, dict) else {}
+    )
 
 
 def _names(names: Any, shape: Any) -> tuple[str, ...]:

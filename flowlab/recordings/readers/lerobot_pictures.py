@@ -1,4 +1,4 @@
-"""Pictures of a LeRobot episode: embedded in its table or frames of a video, and depth of whatever code as distances."""
+"""Pictures of a LeRobot episode: embedded in its table or frames of a video; depth of any code as distances."""
 
 import math
 from collections.abc import Iterator
@@ -46,8 +46,13 @@ class DepthCode:
         """Why it is none; empty where it is one."""
         numbers = (self.depth_min, self.depth_max, self.shift)
         if not all(math.isfinite(x) for x in numbers) or not 0 <= self.depth_min < self.depth_max <= 1e4:
-            return f"depth_min {self.depth_min:g} and depth_max {self.depth_max:g}, expected 0 <= depth_min < depth_max [m]"
-        return f"shift {self.shift:g}, expected more than -depth_min" if self.use_log and self.depth_min + self.shift <= 0 else ""
+            found = f"depth_min {self.depth_min:g} and depth_max {self.depth_max:g}"
+            return f"{found}, expected 0 <= depth_min < depth_max [m]"
+        return (
+            f"shift {self.shift:g}, expected more than -depth_min"
+            if self.use_log and self.depth_min + self.shift <= 0
+            else ""
+        )
 
     def meters(self, codes: UInt16[np.ndarray, "..."]) -> Num[np.ndarray, "..."]:
         """Distances [m]; 0 for the first and the last code, into which everything nearer and farther was put."""
@@ -59,7 +64,11 @@ class DepthCode:
     def step_m(self, depth_m: float) -> float:
         """How far apart two codes are at a distance [m]."""
         span = (self.depth_max + self.shift) / (self.depth_min + self.shift)
-        return (depth_m + self.shift) * math.log(span) / _LAST_CODE if self.use_log else (self.depth_max - self.depth_min) / _LAST_CODE
+        return (
+            (depth_m + self.shift) * math.log(span) / _LAST_CODE
+            if self.use_log
+            else (self.depth_max - self.depth_min) / _LAST_CODE
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +108,9 @@ def read_pictures(one: LeRobotEpisode, feature: LeRobotFeature, first: int, time
     if code is None:
         return LeRobotPictures(stream)
     said = any(f"video.{k}" in feature.info or k in feature.info for k in ("depth_min", "depth_max"))
-    return LeRobotPictures(stream, (("the code of the depth video", Metadata(depth_unit_m=1.0)),), (_of_code(code, said),))
+    return LeRobotPictures(
+        stream, (("the code of the depth video", Metadata(depth_unit_m=1.0)),), (_of_code(code, said),)
+    )
 
 
 def _check_film(one: LeRobotEpisode, path: Path, feature: LeRobotFeature, last_s: float) -> None:
@@ -110,11 +121,12 @@ def _check_film(one: LeRobotEpisode, path: Path, feature: LeRobotFeature, last_s
         raise DataError(f"{path}: has pictures of {about['width']}x{about['height']}, and {shown(feature.name)} in "
                         f"meta/info.json has the shape {list(feature.shape)}")  # fmt: skip
     if about["end_s"] and about["end_s"] < last_s:
-        raise DataError(f"{path}: ends after {about['end_s']:.3f} s, and the last picture of {one.where.name} would be at "
-                        f"{last_s:.3f} s; copy it again")  # fmt: skip
+        raise DataError(f"{path}: ends after {about['end_s']:.3f} s, and the last picture of {one.where.name} would "
+                        f"be at {last_s:.3f} s; copy it again")  # fmt: skip
     if feature.is_depth and about["format"] not in ("gray12le", "yuv420p12le"):
-        raise DataError(f"{path}: is said to be depth and has pixels of {shown(about['format'])[1:-1]}, expected gray12le, 12-bit "
-                        "codes; colors are no distances")  # fmt: skip
+        found = shown(about["format"])[1:-1]
+        raise DataError(f"{path}: is said to be depth and has pixels of {found}, expected gray12le, 12-bit codes; "
+                        "colors are no distances")  # fmt: skip
 
 
 def depth_code(one: LeRobotEpisode, feature: LeRobotFeature) -> DepthCode:
@@ -122,9 +134,13 @@ def depth_code(one: LeRobotEpisode, feature: LeRobotFeature) -> DepthCode:
     values: dict[str, Any] = {}
     for key, kind in (("depth_min", float), ("depth_max", float), ("shift", float), ("use_log", bool)):
         value = feature.info.get(f"video.{key}", feature.info.get(key))
-        fits = isinstance(value, bool) if kind is bool else isinstance(value, int | float) and not isinstance(value, bool)
+        fits = (
+            isinstance(value, bool) if kind is bool else isinstance(value, int | float) and not isinstance(value, bool)
+        )
         if value is not None and not fits:
-            raise DataError(f"{one.info.place}: video.{key} of {shown(feature.name)} is {shown(value)}, expected a {kind.__name__}")
+            raise DataError(
+                f"{one.info.place}: video.{key} of {shown(feature.name)} is {shown(value)}, expected a {kind.__name__}"
+            )
         values |= {} if value is None else {key: kind(value)}
     code = DepthCode(**values)
     if code.fault:
@@ -134,8 +150,8 @@ def depth_code(one: LeRobotEpisode, feature: LeRobotFeature) -> DepthCode:
 
 def _of_code(code: DepthCode, said: bool) -> Check:
     steps = ", ".join(f"{1000 * code.step_m(x):.1f} at {x:g} m" for x in (0.3, 1.0, 2.0))
-    says = (f"12-bit code of the video from {code.depth_min:g} to {code.depth_max:g} m, in steps of {steps} [mm]; what is at either "
-            "end is no reading, since the code puts pixels without one there")  # fmt: skip
+    says = (f"12-bit code of the video from {code.depth_min:g} to {code.depth_max:g} m, in steps of {steps} [mm]; "
+            "what is at either end is no reading, since the code puts pixels without one there")  # fmt: skip
     says += "" if said else "; the dataset does not say its range, and LeRobot's usual one was taken"
     return Check("depth code", Verdict.OK if said else Verdict.ASSUMED, says)
 
@@ -176,7 +192,9 @@ def _embedded(path: Path, name: str, row: int) -> bytes:
     return content
 
 
-def _frame(path: Path, at_s: Float64[np.ndarray, "N"], tolerance_s: float, code: DepthCode | None, index: int) -> Num[np.ndarray, "..."]:
+def _frame(
+    path: Path, at_s: Float64[np.ndarray, "N"], tolerance_s: float, code: DepthCode | None, index: int
+) -> Num[np.ndarray, "..."]:
     try:
         pixels: np.ndarray = ask(path, "frame", float(at_s[index]), tolerance_s, code is not None)
     except DataError as error:

@@ -30,7 +30,9 @@ def ask(path: Path, what: str, *arguments: Any) -> Any:
     try:
         size = check_regular(path, MAX_ARRAY_BYTES)
     except MissingFileError as error:
-        raise MissingFileError(f"{path}: there is no such file, and the dataset says so; copy the dataset again") from error
+        raise MissingFileError(
+            f"{path}: there is no such file, and the dataset says so; copy the dataset again"
+        ) from error
     if size < 1024 and read_bytes(path).startswith(_POINTER):
         raise DataError(f"{path}: is a pointer of Git LFS, not the file itself; get it with 'git lfs pull'")
     return ask_of_file(_SERVE, path, path.stat().st_mtime_ns, what, arguments, words=_WORDS)

@@ -41,7 +41,9 @@ class ParquetTables:
             raise DataError(f"{path}: has {file.metadata.num_rows:,} rows, expected at most {MAX_FILES:,}")
         return {n: column.to_pylist() for n, column in zip(names, self._read(path, names).columns, strict=True)}
 
-    def columns(self, path: str, names: Sequence[str], first: int = 0, count: int | None = None) -> dict[str, np.ndarray]:
+    def columns(
+        self, path: str, names: Sequence[str], first: int = 0, count: int | None = None
+    ) -> dict[str, np.ndarray]:
         """Columns of numbers, those of ``names`` that there are, each with a row a step.
 
         Raises:
@@ -63,7 +65,9 @@ class ParquetTables:
         value = self._pictures[key][row - first].as_py()
         content = value.get("bytes") if isinstance(value, dict) else value
         if not isinstance(content, bytes):
-            where = f"; it names {shown(value['path'])} instead" if isinstance(value, dict) and value.get("path") else ""
+            where = (
+                f"; it names {shown(value['path'])} instead" if isinstance(value, dict) and value.get("path") else ""
+            )
             raise DataError(f"{path}: {shown(name)} has no picture embedded in row {row}{where}")
         return content
 
@@ -71,11 +75,13 @@ class ParquetTables:
         key = _state(path)
         if key not in self._opened:
             try:
-                file = pq.ParquetFile(path, thrift_string_size_limit=MAX_TEXT_BYTES)
+                file = pq.ParquetFile(path, thrift_string_size_limit=MAX_TEXT_BYTES, page_checksum_verification=True)
             except (pa.ArrowException, OSError, ValueError) as error:
                 raise DataError(f"{path}: is no readable Parquet file ({first_line(error)}); copy it again") from error
             if file.metadata.num_rows > MAX_TABLE_ROWS or file.metadata.num_row_groups > MAX_FILES:
-                raise DataError(f"{path}: says it has {file.metadata.num_rows:,} rows, expected at most {MAX_TABLE_ROWS:,}")
+                raise DataError(
+                    f"{path}: says it has {file.metadata.num_rows:,} rows, expected at most {MAX_TABLE_ROWS:,}"
+                )
             while len(self._opened) >= _KEPT:
                 self._opened.pop(next(iter(self._opened)))
             self._opened[key] = file
@@ -109,7 +115,9 @@ class ParquetTables:
             size += sum(max(c.total_uncompressed_size, 8 * c.num_values if "." in c.path_in_schema else 0)
                         for c in chunks if any(f"{c.path_in_schema}.".startswith(f"{n}.") for n in names))  # fmt: skip
         if size > MAX_LOADED_BYTES:
-            raise DataError(f"{path}: {shown(names[0])} unpacks to {size:,} bytes, expected at most {MAX_LOADED_BYTES:,}")
+            raise DataError(
+                f"{path}: {shown(names[0])} unpacks to {size:,} bytes, expected at most {MAX_LOADED_BYTES:,}"
+            )
         try:
             table = file.read_row_groups(groups, columns=list(names), use_threads=False)
             return table.select(list(names))

@@ -62,7 +62,9 @@ class _Film:
     def __init__(self, path: str) -> None:
         self._path = path
         try:  # as MP4 and nothing else: lists of other files are formats, too
-            self._container = av.open(path, format="mp4", options={"protocol_whitelist": "file"}, metadata_errors="replace")
+            self._container = av.open(
+                path, format="mp4", options={"protocol_whitelist": "file"}, metadata_errors="replace"
+            )
             if not self._container.streams.video:
                 raise ValueError("it holds no video")
             stream = self._stream = self._container.streams.video[0]
@@ -72,8 +74,10 @@ class _Film:
         if context.name not in _CODECS:
             raise DataError(f"{path}: is coded as {context.name}, expected h264, hevc, av1 or vp9")
         if not 0 < context.width * context.height <= MAX_PIXELS:
-            raise DataError(f"{path}: says it has {context.width} x {context.height} pixels, expected 1 to {MAX_PIXELS:,}")
-        context.options = {"max_pixels": str(MAX_PIXELS)}
+            raise DataError(
+                f"{path}: says it has {context.width} x {context.height} pixels, expected 1 to {MAX_PIXELS:,}"
+            )
+        context.options = {"max_pixels": str(MAX_PIXELS), "err_detect": "explode"}
         context.thread_count = 1
         stream_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
         self.about = {"width": context.width, "height": context.height, "format": context.pix_fmt or "",
@@ -111,6 +115,8 @@ class _Film:
         self._frames, self._last = self._container.decode(self._stream), None
 
     def _pixels(self, frame: Any, deep: bool) -> np.ndarray:
+        if frame.is_corrupt:
+            raise DataError(f"{self._path}: is damaged at {frame.time:.4f} s")
         if (frame.width, frame.height) != (self.about["width"], self.about["height"]):
             raise DataError(f"{self._path}: changes its size to {frame.width}x{frame.height} on the way")
         if not deep:

@@ -15,7 +15,7 @@ from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import EpisodeRef
 from flowlab.storage.exporters.base import Exporter, select_episodes
-from flowlab.storage.exporters.lerobot_features import ExportPlan, make_plan
+from flowlab.storage.exporters.lerobot_features import ExportPlan, calibration, make_plan, said_of_episode
 from flowlab.storage.exporters.lerobot_pictures import picture_features
 from flowlab.storage.exporters.lerobot_stats import FeatureStats, flattened
 from flowlab.storage.exporters.lerobot_tables import TableWriter, as_column, write_table, write_tasks
@@ -23,7 +23,13 @@ from flowlab.version import __version__
 
 _LOG = logging.getLogger(__name__)
 _DATA_MB, _VIDEO_MB, _FILES_TO_CHUNK = 100, 200, 1000
-_OWN = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+_OWN = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 """Columns that every dataset of LeRobot has."""
 _PATHS = {
     "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
@@ -37,8 +43,9 @@ configs:
 ---
 # {name}
 
-{episodes} episodes, {frames} steps, {fps} a second, exported by flowlab {version} as LeRobotDataset v3.0. What the numbers
-mean and where they come from is in `meta/flowlab.json`; what each feature holds is in its `info` in `meta/info.json`.
+{episodes} episodes, {frames} steps, {fps} a second, exported by flowlab {version} as LeRobotDataset v3.0. What the
+numbers mean and where they come from is in `meta/flowlab.json`; what each feature holds is in its `info` in
+`meta/info.json`.
 
 Not written: {left_out}.
 """
@@ -75,20 +82,28 @@ class LeRobotExporter(Exporter):
             export.write()
             (folder / "README.md").write_text(_card(dataset.path.name, chosen, plan))
         if plan.left_out:
-            _LOG.warning("flowlab: %s: not written, as LeRobot has no features for it: %s", path, ", ".join(sorted(plan.left_out)))
+            _LOG.warning(
+                "flowlab: %s: not written, as LeRobot has no features for it: %s",
+                path,
+                ", ".join(sorted(plan.left_out)),
+            )
         return len(chosen)
 
 
 def _card(name: str, chosen: Sequence[EpisodeRef], plan: ExportPlan) -> str:
     left_out = "; ".join(f"`{array}` ({meaning})" for array, meaning in plan.left_out.items()) or "nothing"
     frames = sum(ref.frames for ref in chosen)
-    return _CARD.format(name=name, episodes=len(chosen), frames=frames, fps=plan.fps, version=__version__, left_out=left_out)
+    return _CARD.format(
+        name=name, episodes=len(chosen), frames=frames, fps=plan.fps, version=__version__, left_out=left_out
+    )
 
 
 class _Export:
     """One export at work."""
 
-    def __init__(self, how: LeRobotExporter, dataset: Dataset, chosen: Sequence[EpisodeRef], plan: ExportPlan, folder: Path) -> None:
+    def __init__(
+        self, how: LeRobotExporter, dataset: Dataset, chosen: Sequence[EpisodeRef], plan: ExportPlan, folder: Path
+    ) -> None:
         self._dataset, self._chosen, self._plan, self._folder = dataset, chosen, plan, folder
         self._tasks = list(dict.fromkeys(ref.task for ref in chosen))
         self._table = TableWriter(folder / "data", _DATA_MB << 20)
@@ -126,7 +141,7 @@ class _Export:
         """Write an episode; what ``meta/episodes`` says of it."""
         count = len(episode)
         steps = np.arange(count)
-        own = {"timestamp": (steps / self._plan.fps).astype(np.float32), "frame_index": steps,
+        own: dict[str, np.ndarray] = {"timestamp": (steps / self._plan.fps).astype(np.float32), "frame_index": steps,
                "episode_index": np.full(count, k), "index": first + steps,
                "task_index": np.full(count, self._tasks.index(episode.task))}  # fmt: skip
         values = {name: x.astype(_OWN[name])[:, None] for name, x in own.items()}
@@ -141,10 +156,11 @@ class _Export:
             columns |= {} if column is None else {picture.name: column}
             videos |= {} if part is None else {f"videos/{picture.name}/{key}": value for key, value in part.items()}
             stats[picture.name] = self._stats[picture.name].add(picture.sample(episode), count)
-        self._cameras.append(_calibration(episode))
-        said = {"episode_index": k, "tasks": [episode.task], "length": count, **_place(self._table.add(columns), "data/"),
+        self._cameras.append(calibration(episode))
+        said = {"episode_index": k, "tasks": [episode.task], "length": count,
+                **_place(self._table.add(columns), "data/"),
                 "dataset_from_index": first, "dataset_to_index": first + count, **videos,
-                **_place(0, "meta/episodes/"), **_of_episode(episode)}  # fmt: skip
+                **_place(0, "meta/episodes/"), **said_of_episode(episode)}  # fmt: skip
         flat = {f"stats/{name}/{key}": value for name, s in stats.items() for key, value in flattened(s).items()}
         return said | flat
 
@@ -152,7 +168,11 @@ class _Export:
         """``meta/info.json``."""
         shared = self._cameras[0] if all(c == self._cameras[0] for c in self._cameras) else {}
         own: dict[str, Any] = {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _OWN.items()}
-        features = {p.name: p.to_json(shared) for p in self._pictures} | {f.name: f.to_json() for f in self._plan.features} | own
+        features = (
+            {p.name: p.to_json(shared) for p in self._pictures}
+            | {f.name: f.to_json() for f in self._plan.features}
+            | own
+        )
         return {
             "codebase_version": "v3.0",
             "robot_type": None,
@@ -176,7 +196,9 @@ class _Export:
             "fingerprint": self._dataset.fingerprint,
             "units": dict(self._dataset.manifest.units),
             "provenance": json.loads(self._dataset.provenance.model_dump_json()),
-            "camera": self._cameras[0] if all(c == self._cameras[0] for c in self._cameras) else "by episode: meta/episodes",
+            "camera": self._cameras[0]
+            if all(c == self._cameras[0] for c in self._cameras)
+            else "by episode: meta/episodes",
             "left_out": dict(self._plan.left_out),
         }
 
@@ -185,30 +207,6 @@ def _place(file: int, of: str) -> dict[str, int]:
     return {f"{of}chunk_index": file // _FILES_TO_CHUNK, f"{of}file_index": file % _FILES_TO_CHUNK}
 
 
-def _calibration(episode: Episode) -> dict[str, Any]:
-    """The camera as the ``info`` of its pictures has it; without a pose where it moves."""
-    camera = episode.camera
-    pose = {} if episode.T_world_cam is not None else {"T_world_cam": camera.T_world_cam.tolist()}
-    return {"K": camera.K.tolist(), "width": camera.width, "height": camera.height, "pixel_centers": 0.0, "axes": "opencv", **pose}
-
-
-def _of_episode(episode: Episode) -> dict[str, Any]:
-    """What is said of an episode beyond what LeRobot asks for."""
-    calibration = _calibration(episode)
-    pose = calibration.get("T_world_cam")
-    return {
-        "success": bool(episode.success.any()),
-        "seed": int(episode.seed),
-        "source": str(episode.extras.get("source", "")),
-        "query_count": int(episode.queries.count),
-        "query_role": episode.query_role.tolist(),
-        "camera/K": np.ravel(calibration["K"]).tolist(),
-        "camera/T_world_cam": None if pose is None else np.ravel(pose).tolist(),
-    }
-
-
 def _write_json(path: Path, values: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(values, indent=4) + "\n")
-
-

@@ -52,7 +52,12 @@ class TableFeature:
 
     def to_json(self) -> dict[str, Any]:
         """As ``meta/info.json`` has it."""
-        return {"dtype": self.dtype, "shape": list(self.shape), "names": list(self.names) or None, "info": dict(self.info)}
+        return {
+            "dtype": self.dtype,
+            "shape": list(self.shape),
+            "names": list(self.names) or None,
+            "info": dict(self.info),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +96,11 @@ def make_plan(dataset: Dataset, chosen: Sequence[EpisodeRef], *, flat: bool) -> 
     for spec in (*taken, *pictures):
         if len(shapes[spec.path]) > 1:
             found = " and ".join(str(list(x)) for x in sorted(shapes[spec.path]))
-            raise DataError(f"{dataset.path}: '{spec.path}' has the shapes {found} in its episodes, and LeRobot has one shape for "
-                            "each feature; export them one by one, with --task or after 'flowlab subset'")  # fmt: skip
-    features = [made for s in taken if (made := _feature(s, next(iter(shapes[s.path])), dataset.provenance, flat)) is not None]
+            raise DataError(f"{dataset.path}: '{spec.path}' has the shapes {found} in its episodes, and LeRobot has "
+                            "one shape for each feature; export them apart, by --task or 'flowlab subset'")  # fmt: skip
+    features = [
+        made for s in taken if (made := _feature(s, next(iter(shapes[s.path])), dataset.provenance, flat)) is not None
+    ]
     kept = {s.path for s in (*taken, *pictures)} | {*_OF_EPISODES}
     left_out = {s.path: s.meaning for s in SCHEMA if s.path in shapes and s.path not in kept}
     sizes = {s.name: next(iter(shapes[s.path]))[:2] for s in pictures}
@@ -117,7 +124,9 @@ def _feature(spec: ArraySpec, shape: tuple[int, ...], known: Provenance, flat: b
         assert values is not None
         return np.ascontiguousarray(values, dtype).reshape(len(episode), *stored)
 
-    return TableFeature(_NAMES[spec.path], dtype, stored, names, of, by_axis, {"unit": spec.unit, "meaning": spec.meaning})
+    return TableFeature(
+        _NAMES[spec.path], dtype, stored, names, of, by_axis, {"unit": spec.unit, "meaning": spec.meaning}
+    )
 
 
 def _channel_names(channels: Sequence[Channels], width: int) -> tuple[str, ...]:
@@ -139,3 +148,32 @@ def _rate(shards: Any, chosen: Sequence[EpisodeRef]) -> int:
              for k, rows in enumerate(shard.rows()) if (name, k) in wanted]  # fmt: skip
     every = np.concatenate(steps)
     return max(1, round(1 / float(np.median(every)))) if len(every) else 1
+
+
+def calibration(episode: Episode) -> dict[str, Any]:
+    """The camera as the ``info`` of its pictures has it; without a pose where it moves."""
+    camera = episode.camera
+    pose = {} if episode.T_world_cam is not None else {"T_world_cam": camera.T_world_cam.tolist()}
+    return {
+        "K": camera.K.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+        "pixel_centers": 0.0,
+        "axes": "opencv",
+        **pose,
+    }
+
+
+def said_of_episode(episode: Episode) -> dict[str, Any]:
+    """What is said of an episode beyond what LeRobot asks for."""
+    camera = calibration(episode)
+    pose = camera.get("T_world_cam")
+    return {
+        "success": bool(episode.success.any()),
+        "seed": int(episode.seed),
+        "source": str(episode.extras.get("source", "")),
+        "query_count": int(episode.queries.count),
+        "query_role": episode.query_role.tolist(),
+        "camera/K": np.ravel(camera["K"]).tolist(),
+        "camera/T_world_cam": None if pose is None else np.ravel(pose).tolist(),
+    }

@@ -28,8 +28,10 @@ _SAMPLED, _ACROSS = 20, 64
 class PictureFeature:
     """A feature with a picture for each step."""
 
-    def __init__(self, name: str, size: tuple[int, int], kind: Literal["rgb", "mm", "m", "video"], video: VideoWriter | None,
-                 codec: VideoCodec | None, fps: int) -> None:  # fmt: skip
+    def __init__(
+        self, name: str, size: tuple[int, int], kind: Literal["rgb", "mm", "m", "video"],
+        video: VideoWriter | None, codec: VideoCodec | None, fps: int,
+    ) -> None:  # fmt: skip
         self.name, self._size, self._kind = name, size, kind
         self._video, self._codec, self._fps = video, codec, fps
 
@@ -48,8 +50,8 @@ class PictureFeature:
         pictures = self._pictures(episode)
         if self._video is not None:
             part = self._video.add(map(depth_codes, pictures) if self._kind == "video" else pictures)
-            return None, {"chunk_index": part.file // 1000, "file_index": part.file % 1000, "from_timestamp": part.from_s,
-                          "to_timestamp": part.to_s}  # fmt: skip
+            return None, {"chunk_index": part.file // 1000, "file_index": part.file % 1000,
+                          "from_timestamp": part.from_s, "to_timestamp": part.to_s}  # fmt: skip
         suffix = ".tiff" if self._kind == "m" else ".png"
         coded = [png(p) if self._kind == "rgb" else depth_image(p, self._kind) for p in pictures]
         return as_pictures(coded, [f"frame-{t:06d}{suffix}" for t in range(len(coded))]), None
@@ -68,7 +70,8 @@ class PictureFeature:
         info: dict[str, Any] = {"is_depth_map": self._kind != "rgb"}
         info |= {"depth_unit": "m" if self._kind == "m" else "mm"} if self._kind != "rgb" else {}
         if self._codec is not None:
-            info |= {"video.height": height, "video.width": width, "video.codec": {"libx264": "h264"}.get(self._codec.name, "hevc"),
+            codec = "h264" if self._codec.name == "libx264" else "hevc"
+            info |= {"video.height": height, "video.width": width, "video.codec": codec,
                      "video.pix_fmt": self._codec.pixels, "video.fps": self._fps, "video.channels": self.channels,
                      "video.g": self._codec.group, "has_audio": False}  # fmt: skip
         info |= {f"video.{key}": value for key, value in DEPTH_CODE.items()} if self._kind == "video" else {}
@@ -90,8 +93,16 @@ class PictureFeature:
         yield from pictures
 
 
-def picture_features(plan: ExportPlan, folder: Path, *, camera: str, rgb: Literal["video", "image"],
-                     depth: Literal["mm", "m", "video"], crf: int, most_bytes: int) -> list[PictureFeature]:  # fmt: skip
+def picture_features(
+    plan: ExportPlan,
+    folder: Path,
+    *,
+    camera: str,
+    rgb: Literal["video", "image"],
+    depth: Literal["mm", "m", "video"],
+    crf: int,
+    most_bytes: int,
+) -> list[PictureFeature]:
     """The features of the pictures that a dataset keeps.
 
     Args:

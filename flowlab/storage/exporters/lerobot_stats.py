@@ -45,11 +45,19 @@ class FeatureStats:
 
     def to_json(self) -> dict[str, Any]:
         """The statistics of all episodes; quantiles are of up to 2,000 evenly spaced values of each."""
-        return self._told(self._low, self._high, self._mean, self._squares / self._values, np.concatenate(self._kept), self._count)
+        return self._told(
+            self._low, self._high, self._mean, self._squares / self._values, np.concatenate(self._kept), self._count
+        )
 
     def _told(self, low: Any, high: Any, mean: Any, variance: Any, rows: np.ndarray, count: int) -> dict[str, Any]:
         quantiles = np.quantile(rows, list(_QUANTILES.values()), axis=0)
-        values = {"min": low, "max": high, "mean": mean, "std": np.sqrt(variance), **dict(zip(_QUANTILES, quantiles, strict=True))}
+        values = {
+            "min": low,
+            "max": high,
+            "mean": mean,
+            "std": np.sqrt(variance),
+            **dict(zip(_QUANTILES, quantiles, strict=True)),
+        }
         return {**{k: np.reshape(v, self._shape).tolist() for k, v in values.items()}, "count": [count]}
 
 
@@ -60,4 +68,4 @@ def flattened(stats: dict[str, Any]) -> dict[str, list[Any]]:
 
 def evenly(count: int, most: int) -> Iterable[int]:
     """Indices of at most so many of some pictures, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()  # type: ignore[no-any-return]
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()

@@ -65,7 +65,14 @@ class TableWriter:
         path = self._folder / f"chunk-{self._file // 1000:03d}" / f"file-{self._file % 1000:03d}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         split = [leaf for f in schema if (leaf := _float_leaf(f.name, f.type))]
-        self._writer = pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=split)
+        self._writer = pq.ParquetWriter(
+            path,
+            schema,
+            compression="zstd",
+            use_dictionary=False,
+            use_byte_stream_split=split,
+            write_page_checksum=True,
+        )
 
 
 def _float_leaf(name: str, kind: Any) -> str:

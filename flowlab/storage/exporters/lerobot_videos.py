@@ -127,7 +127,7 @@ class VideoWriter:
             return av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
         frame = av.VideoFrame(width, height, self._codec.pixels)
         plane = frame.planes[0]
-        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+        rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
         rows[:height, : 2 * width] = np.ascontiguousarray(picture, "<u2").view(np.uint8).reshape(height, 2 * width)
         return frame
 
@@ -140,5 +140,7 @@ class VideoWriter:
                 self._container.mux(packet)
         except av.FFmpegError as error:
             height, width = self._size
-            raise DataError(f"{self._folder.name}: pictures of {width}x{height} cannot be made a video by {self._codec.name} "
-                            f"({first_line(error)}); write images, with --set rgb=image or --set depth=mm") from error  # fmt: skip
+            raise DataError(
+                f"{self._folder.name}: pictures of {width}x{height} cannot be made a video by {self._codec.name} "
+                f"({first_line(error)}); write images, with --set rgb=image or --set depth=mm"
+            ) from error
