@@ -30,12 +30,13 @@ def write_video(path: Path, pictures: np.ndarray, fps: int = FPS, codec: str | N
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec or ("libx265" if deep else "libx264"), rate=fps)
         stream.width, stream.height = pictures.shape[2], pictures.shape[1]
-        stream.pix_fmt = "gray12le" if deep else "yuv444p"
-        stream.options = (
-            {"x265-params": "lossless=1:log-level=none:bframes=0", "preset": "ultrafast"}
-            if deep
-            else {"crf": "4", "bf": "0", "g": "2"}
-        )
+        kind = "depth" if deep else codec or "libx264"
+        stream.pix_fmt = {"depth": "gray12le", "libx264": "yuv444p"}.get(kind, "yuv420p")
+        stream.options = {
+            "depth": {"x265-params": "lossless=1:log-level=none:bframes=0", "preset": "ultrafast"},
+            "libx264": {"crf": "4", "bf": "0", "g": "2"},
+            "libsvtav1": {"crf": "30", "preset": "12", "g": "2"},
+        }[kind]
         for k, picture in enumerate(pictures):
             if deep:
                 frame = av.VideoFrame(picture.shape[1], picture.shape[0], "gray12le")

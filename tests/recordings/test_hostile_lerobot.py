@@ -118,6 +118,10 @@ REFUSED: dict[str, tuple[Change, str]] = {
         of_feature("action", shape=[7]),
         r"action has 9 numbers a step, and meta/info.json gives it the shape \[7\]",
     ),
+    "another depth picture": (
+        of_feature(DEPTH, shape=[480, 640, 1]),
+        r"has pictures of 128x96, and '.*front_depth' in .* has the shape \[480, 640, 1\]",
+    ),
     "another picture": (
         of_feature(COLOR, shape=[480, 640, 3]),
         r"has pictures of 128x96, and '.*front' in .* has the shape \[480, 640, 3\]",

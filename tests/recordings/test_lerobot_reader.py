@@ -16,9 +16,11 @@ from lerobot_files import CAMERA, COLOR, DEPTH, FPS, codes, v3, v21, write_video
 from real_recordings import opened, write_yaml
 from synthetic import edit_json
 
+from flowlab.recordings.base import choose_reader, read_streams
 from flowlab.recordings.identity import identity
 from flowlab.recordings.parsing import RecordingSettings
 from flowlab.recordings.recording import find_recordings
+from flowlab.recordings.recording_yaml import Metadata
 
 Capture = pytest.CaptureFixture[str]
 Write = Callable[..., Path]
@@ -192,3 +194,13 @@ def test_v20_is_read_too(tmp_path: Path, capsys: Capture) -> None:
     path = v21(tmp_path / "d", demos=1, color="png", codebase_version="v2.0")
     assert json.loads((path / "meta/info.json").read_text())["codebase_version"] == "v2.0"
     assert dry_run(capsys, path).code == 0
+
+
+def test_the_usual_codec_of_lerobot_is_decoded_from_wherever_one_begins(tmp_path: Path) -> None:
+    path = v3(tmp_path / "d")
+    both = np.concatenate([filmed(k).rgb for k in range(2)])
+    write_video(path / f"videos/{COLOR}/chunk-000/file-000.mp4", both, codec="libsvtav1")
+    for k in (1, 0):
+        streams = read_streams(choose_reader(path), path / f"episode_{k}", Metadata())
+        for t in (4, 1, 0, 3, 2):
+            assert np.abs(streams.color.read(t).astype(int) - filmed(k).rgb[t]).mean() < 8

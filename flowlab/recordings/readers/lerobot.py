@@ -1,6 +1,6 @@
 """Datasets of LeRobot, v3.0 and v2.x: one camera with depth, and the robot, of every episode."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +67,11 @@ class LeRobotReader:
         first, last = _rows(one)
         numbers = _numbers(one, first, last)
         stamps = _stamps(one, numbers)
-        time_s = np.ascontiguousarray(numbers.get(TIME, np.arange(last - first) / one.info.fps).reshape(-1), np.float64)
+        time_s = np.ascontiguousarray(numbers.get(TIME, stamps).reshape(-1), np.float64)
         color, depth = (read_pictures(one, f, first, time_s, stamps) for f in (camera.color, camera.depth))
         timing = Timing("the timestamps")
         state, action = (_stream(one, name, numbers, time_s, timing) for name in (STATE, ACTION))
-        unread = _unread(one, (camera.color.name, camera.depth.name))
+        unread = _unread(one, {camera.color.name, camera.depth.name, *numbers})
         return Streams(
             color.stream,
             depth.stream,
@@ -105,7 +105,8 @@ def _rows(one: LeRobotEpisode) -> tuple[int, int]:
 
 def _numbers(one: LeRobotEpisode, first: int, last: int) -> dict[str, np.ndarray]:
     """The columns of numbers that are used, of the rows of an episode."""
-    wanted = [STATE, ACTION, SUCCESS, TIME, POSES, "timestamp", "frame_index"]
+    own = [n for n in (TIME, POSES) if (f := one.info.features.get(n)) is not None and "meaning" in f.info]
+    wanted = [STATE, ACTION, SUCCESS, *own, "timestamp", "frame_index"]
     lacking = [n for n in (STATE, ACTION) if n in one.info.features and n not in ask(one.data, "names")]
     if lacking:
         raise DataError(f"{one.data}: has no column {lacking[0]}, which meta/info.json says there is")
@@ -180,10 +181,9 @@ def _of_tasks(one: LeRobotEpisode) -> Iterator[Check]:
         yield Check("task", Verdict.ASSUMED, says)
 
 
-def _unread(one: LeRobotEpisode, pictures: Sequence[str]) -> tuple[str, ...]:
+def _unread(one: LeRobotEpisode, used: Collection[str]) -> tuple[str, ...]:
     """Features that nothing uses."""
-    used = {*pictures, STATE, ACTION, SUCCESS, TIME, POSES, *_COUNTS}
-    return tuple(shown(name)[1:-1] for name in one.info.features if name not in used)
+    return tuple(shown(name)[1:-1] for name in one.info.features if name not in used and name not in _COUNTS)
 
 
 def _left_out(unread: Sequence[str], given: Metadata) -> Check:

@@ -99,7 +99,8 @@ def read_pictures(one: LeRobotEpisode, feature: LeRobotFeature, first: int, time
     code = depth_code(one, feature) if feature.is_depth and feature.dtype == "video" else None
     if feature.dtype == "image":
         read = partial(_depth_image if feature.is_depth else _color_image, one.data, feature.name, first)
-        unit = _unit_of_images(one, feature, read) if feature.is_depth else ()
+        kind = _kind_of_images(one, feature, read)
+        unit = _unit_of_images(one, feature, kind) if feature.is_depth else ()
         return LeRobotPictures(ImageStream(names, time_s, read, timing), unit)
     path, start_s = one.video(feature.name)
     _check_film(one, path, feature, start_s + float(stamps_s[-1]))
@@ -156,16 +157,27 @@ def _of_code(code: DepthCode, said: bool) -> Check:
     return Check("depth code", Verdict.OK if said else Verdict.ASSUMED, says)
 
 
-def _unit_of_images(one: LeRobotEpisode, feature: LeRobotFeature, read: Any) -> tuple[tuple[str, Metadata], ...]:
+def _kind_of_images(one: LeRobotEpisode, feature: LeRobotFeature, read: Any) -> str:
+    """Of which kind the numbers of the first picture are; empty where it is bad. Refuses another size than is said."""
+    try:
+        picture: np.ndarray = read(0)
+    except (BadImage, FlowlabError):
+        return ""
+    if len(feature.shape) == 3 and not set(picture.shape[:2]) <= set(feature.shape):
+        height, width = picture.shape[:2]
+        raise DataError(f"{one.data}: has pictures of {width}x{height}, and {shown(feature.name)} in "
+                        f"meta/info.json has the shape {list(feature.shape)}")  # fmt: skip
+    return picture.dtype.kind
+
+
+def _unit_of_images(one: LeRobotEpisode, feature: LeRobotFeature, kind: str) -> tuple[tuple[str, Metadata], ...]:
     """The unit of depth pictures: as the feature says, else millimeters for whole numbers and meters for others."""
     said = feature.info.get("depth_unit")
     if said is not None:
-        if said not in _UNITS:
+        if said not in ("m", "mm"):
             raise DataError(f"{one.info.place}: depth_unit of {shown(feature.name)} is {shown(said)}, expected m or mm")
         return ((f"{one.info.place.name}:{feature.name}", Metadata(depth_unit_m=_UNITS[said])),)
-    try:
-        kind = read(0).dtype.kind
-    except (BadImage, FlowlabError):
+    if not kind:
         return ()
     return ((f"{CUSTOM}LeRobot", Metadata(depth_unit_m=_UNITS["m" if kind == "f" else "mm"])),)
 

@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Num
 
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-_MOST = 2_000
-"""So many values of each channel of an episode are kept for quantiles over all, where it has more."""
+_MOST = 3_000_000
+"""So many numbers of a feature are kept at most for its quantiles."""
+_THINNED = 3
+"""Where there are more, every so many-th is kept: no power of two, as numbers of points often are."""
 
 
 class FeatureStats:
@@ -22,6 +24,7 @@ class FeatureStats:
         self._mean: Any = 0.0
         self._squares: Any = 0.0
         self._kept: list[np.ndarray] = []
+        self._every = 1
 
     def add(self, rows: Num[np.ndarray, "K C"], count: int) -> dict[str, Any]:
         """Take in an episode.
@@ -40,14 +43,20 @@ class FeatureStats:
         self._squares = self._squares + squares + apart**2 * (self._values * n / total)
         self._mean = self._mean + apart * (n / total)
         self._values, self._count = total, self._count + count
-        self._kept.append(rows[np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))])
+        self._keep(rows, total - n)
         return self._told(rows.min(0), rows.max(0), mean, squares / n, rows, count)
 
     def to_json(self) -> dict[str, Any]:
-        """The statistics of all episodes; quantiles are of up to 2,000 evenly spaced values of each."""
-        return self._told(
-            self._low, self._high, self._mean, self._squares / self._values, np.concatenate(self._kept), self._count
-        )
+        """The statistics of all episodes; quantiles are of three million evenly spaced numbers where there are more."""
+        variance = self._squares / self._values
+        return self._told(self._low, self._high, self._mean, variance, np.concatenate(self._kept), self._count)
+
+    def _keep(self, rows: Num[np.ndarray, "K C"], before: int) -> None:
+        """Keep rows for quantiles, of which there were so many before: always every ``self._every``-th of all."""
+        self._kept.append(rows[-before % self._every :: self._every])
+        while sum(x.size for x in self._kept) > _MOST:
+            self._kept = [np.concatenate(self._kept)[::_THINNED]]
+            self._every *= _THINNED
 
     def _told(self, low: Any, high: Any, mean: Any, variance: Any, rows: np.ndarray, count: int) -> dict[str, Any]:
         quantiles = np.quantile(rows, list(_QUANTILES.values()), axis=0)
