@@ -190,6 +190,16 @@ def test_the_word_of_the_dataset_on_success_counts(tmp_path: Path) -> None:
     assert [bool(opened(p).success[-1]) for p in find_recordings([path])] == [False, True]
 
 
+def test_rewards_are_left_out_without_a_question(tmp_path: Path, capsys: Capture) -> None:
+    path = v3(tmp_path / "d", demos=1, color="png")
+    reward = {"dtype": "float32", "shape": [1], "names": None}
+    edit_json(path / "meta/info.json", lambda i: i["features"].update({"next.reward": reward}))
+    assert dry_run(capsys, path).checks["left out"][0] == "ok"
+    edit_json(path / "meta/info.json", lambda i: i["features"].update({"observation.force": reward}))
+    verdict, says = dry_run(capsys, path).checks["left out"]
+    assert (verdict, says.partition(";")[0]) == ("assumed", "not used: observation.force")
+
+
 def test_v20_is_read_too(tmp_path: Path, capsys: Capture) -> None:
     path = v21(tmp_path / "d", demos=1, color="png", codebase_version="v2.0")
     assert json.loads((path / "meta/info.json").read_text())["codebase_version"] == "v2.0"

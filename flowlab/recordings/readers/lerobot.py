@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from flowlab.errors import DataError
 from flowlab.limits import MAX_WIDTH
 from flowlab.recordings.base import SampleStream, Streams
+from flowlab.recordings.harmless_files import why_harmless
 from flowlab.recordings.parts import split_path
 from flowlab.recordings.poses import check_poses, pose_stream
 from flowlab.recordings.readers.lerobot_camera import choose_camera, is_registered, known_calibration
@@ -188,7 +189,9 @@ def _unread(one: LeRobotEpisode, used: Collection[str]) -> tuple[str, ...]:
 
 def _left_out(unread: Sequence[str], given: Metadata) -> Check:
     """What is not used, but for what the user says is not to be used."""
-    asked = [name for name in unread if not is_ignored(name, given.ignore)]
+    told = [name for name in unread if why_harmless(name.replace(".", "_"), None) is None]
+    asked = [name for name in told if not is_ignored(name, given.ignore)]
     if not asked:
-        return Check("left out", Verdict.OK, "all else, as 'ignore' says" if unread else "every feature is used")
+        rest = f"all but {some_of(unread)}, which count what was achieved" if unread else "every feature"
+        return Check("left out", Verdict.OK, "all else, as 'ignore' says" if told else f"{rest} is used")
     return Check("left out", Verdict.ASSUMED, f"not used: {some_of(asked)}; 'ignore: [...]' says that this is right")
