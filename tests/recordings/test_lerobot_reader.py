@@ -74,7 +74,7 @@ def test_a_hole_in_a_depth_video_is_a_hole_again_and_the_steps_are_told(tmp_path
     run = dry_run(capsys, path)
     verdict, says = run.checks["depth code"]
     assert (verdict, "1.3 at 0.3 m, 1.5 at 1 m" in says, "no reading" in says) == ("ok", True, True)
-    found = opened(find_recordings([path])[0]).frame(2).depth
+    found = read_streams(choose_reader(path), path, Metadata()).depth.read(2)
     assert not found[40:50, 40:60].any(), "0 m was coded as 1 cm"
     assert not found[:4].any(), "farther than the code goes"
 
