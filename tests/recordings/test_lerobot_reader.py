@@ -200,6 +200,34 @@ def test_rewards_are_left_out_without_a_question(tmp_path: Path, capsys: Capture
     assert (verdict, says.partition(";")[0]) == ("assumed", "not used: observation.force")
 
 
+def test_episodes_lie_in_several_files(tmp_path: Path) -> None:
+    """As they do where there is more than fits into one, of numbers, videos and what is said of episodes."""
+    path = v3(tmp_path / "d", demos=2)
+    table, told, film = (
+        path / "data/chunk-000/file-000.parquet",
+        path / "meta/episodes/chunk-000/file-000.parquet",
+        path / "videos",
+    )
+    for file, rows in ((table, STEPS), (told, 1)):
+        whole, other = pq.read_table(file), file.with_name("file-001.parquet")
+        pq.write_table(whole.slice(0, rows), file)
+        pq.write_table(whole.slice(rows), other)
+    other = path / "data/chunk-007/file-001.parquet"
+    other.parent.mkdir()
+    table.with_name("file-001.parquet").rename(other)
+    write_video(film / f"{COLOR}/chunk-002/file-003.mp4", filmed(1).rgb)
+    where = {"data/chunk_index": [7], "data/file_index": [1], f"videos/{COLOR}/chunk_index": [2],
+             f"videos/{COLOR}/file_index": [3], f"videos/{COLOR}/from_timestamp": [0.0]}  # fmt: skip
+    edit_table(told.with_name("file-001.parquet"), lambda c: c.update(where))
+    for k, one in enumerate(find_recordings([path])):
+        recording = opened(one)
+        np.testing.assert_array_equal(recording.state, filmed(k).state)
+        for t in range(STEPS):
+            frame = recording.frame(t)
+            assert np.abs(np.asarray(frame.rgb, int) - filmed(k).rgb[t]).mean() < 3
+            np.testing.assert_allclose(frame.depth, filmed(k).depth[t], atol=6e-4)
+
+
 def test_v20_is_read_too(tmp_path: Path, capsys: Capture) -> None:
     path = v21(tmp_path / "d", demos=1, color="png", codebase_version="v2.0")
     assert json.loads((path / "meta/info.json").read_text())["codebase_version"] == "v2.0"

@@ -23,6 +23,7 @@ from flowlab.provenance import Channels
 from flowlab.recordings.parsing import RecordingSettings, parse_recording
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
+from flowlab.storage.exporters import lerobot
 from flowlab.storage.exporters.lerobot import LeRobotExporter
 from flowlab.testing.exporters import CHECKS, MakeExporter
 
@@ -237,6 +238,22 @@ def test_depth_on_request_is_lerobots_video(dataset: Dataset, made: list[Episode
     for (_, frame), depth in zip(found, made[0].depth, strict=True):
         rows = np.frombuffer(frame.planes[0], np.uint8).reshape(frame.height, -1)[:, : 2 * frame.width]
         np.testing.assert_allclose(np.ascontiguousarray(rows).view("<u2").astype(int), codes(depth), atol=1)
+
+
+def test_what_is_too_large_for_one_file_lies_in_several(
+    dataset: Dataset, made: list[Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lerobot, "_DATA_MB", 0)
+    monkeypatch.setattr(lerobot, "_VIDEO_MB", 0)
+    LeRobotExporter().export(dataset, tmp_path / "x")
+    files = [f"chunk-000/file-00{k}" for k in range(3)]
+    for folder, suffix in (("data", "parquet"), (f"videos/{COLOR}", "mp4")):
+        assert all((tmp_path / "x" / folder / f"{name}.{suffix}").is_file() for name in files)
+    for k, episode in enumerate(made):
+        found = parse_recording(tmp_path / f"x/episode_{k}", RecordingSettings()).streams
+        np.testing.assert_array_equal(found.state[0].values, episode.state)
+        assert episode.rgb is not None
+        assert np.abs(found.color.read(3).astype(int) - episode.rgb[3]).mean() < 6
 
 
 def test_flat_is_one_row_of_numbers(dataset: Dataset, made: list[Episode], tmp_path: Path) -> None:
