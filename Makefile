@@ -5,7 +5,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 LONG := OMP_NUM_THREADS=1 nice -n 10 $(BIN)/flowlab bench --workers 1 --device cpu
 unexport PYTHONDONTWRITEBYTECODE # images set it; each of the hundreds of processes would compile all that it imports
 
-.PHONY: demo test test-all openpi ray campaigns lint format house docs wheel benchmark table1 ablations clean help
+.PHONY: demo test test-all openpi lerobot ray campaigns lint format house docs wheel benchmark table1 ablations clean help
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -28,6 +28,11 @@ openpi: .venv/test ## the real openpi-client drives a served policy, in an envir
 ray: .venv/test ## a Ray cluster of two machines makes a dataset, and one of them is killed; needs a machine that is not busy
 	$(PIP) install -c constraints.txt ray
 	FLOWLAB_RAY=1 $(BIN)/pytest tests/pipeline/test_ray_engine.py
+
+lerobot: .venv/test ## LeRobot's own class opens what is exported, in an environment of its own: Python 3.12, 5.2 GB
+	test -d .venv-lerobot || python3.12 -m venv .venv-lerobot
+	.venv-lerobot/bin/python -m pip --disable-pip-version-check -q install --no-cache-dir 'lerobot[dataset]==0.6.1'
+	FLOWLAB_LEROBOT=$(CURDIR)/.venv-lerobot/bin/python $(BIN)/pytest -s tests/storage/test_lerobot_client.py
 
 CAMPAIGN ?= --budget 1200
 campaigns: .venv/test ## kill, flip, fuzz, attack, disk: hours; see docs/reliability.md. CAMPAIGN="--seed 7 --count 50"
@@ -69,7 +74,7 @@ ablations: .venv/run ## the paper's Tables II and III and its learning curves, l
 	$(LONG) --recipe ablations --out docs/results/ablations
 
 clean: ## remove environments and everything made by the targets above
-	rm -rf .venv .venv-openpi .venv-wheel demo dist site
+	rm -rf .venv .venv-lerobot .venv-openpi .venv-wheel demo dist site
 
 .venv/run: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -38,3 +38,7 @@ MAX_SHOWN = 200
 """Characters of a value that an error shows."""
 MAX_WIDTH = 100_000
 """Numbers of a state or an action."""
+MAX_TABLE_ROWS = 10_000_000
+"""Of a Parquet file, which holds the steps of many episodes."""
+MAX_HELPER_BYTES = 6 << 30
+"""Of memory that a process may take in which files of strangers are unpacked."""

@@ -150,15 +150,15 @@ def _reservation(folder: Path) -> str:
 
 @click.command()
 @click.argument("dataset", type=PATH)
-@click.option("--to", "exporter", required=True, metavar="NAME", help="Which tool: dp3, or one of a plug-in.")
+@click.option("--to", "exporter", required=True, metavar="NAME", help="Which tool: lerobot, dp3, or one of a plug-in.")
 @click.option("--out", type=PATH, required=True, help="Where to write.")
 @click.option("--task", help="Only this task's episodes.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change an option of the exporter.")
 def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...]) -> None:
     """Write a dataset in another tool's layout.
 
-    dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads. 'flowlab plugins exporters' lists what
-    is installed.
+    lerobot: a LeRobotDataset v3.0. dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads.
+    'flowlab plugins exporters' lists what is installed.
     """
     from flowlab.storage.dataset import Dataset
     from flowlab.storage.exporters.base import make_exporter

@@ -16,6 +16,7 @@ from flowlab.pipeline.recipe import Recipe, load_recipe
 from flowlab.pipeline.scheduling import ExtractionProgress, RecordingScheduler
 from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.pipeline.units import JobShard, WorkUnit
+from flowlab.recordings.base import DatasetReader, choose_reader
 from flowlab.recordings.identity import difference, identity
 from flowlab.recordings.parsing import files_of_metadata
 from flowlab.recordings.parts import split_path
@@ -25,7 +26,7 @@ from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt, read_receipts
 from flowlab.storage.recorded import Recorded, number_recordings
-from flowlab.text import is_plain_name, shown
+from flowlab.text import file_name, is_plain_name, shown
 
 _LOG = logging.getLogger(__name__)
 
@@ -100,14 +101,14 @@ def labeling_recipe(
 def find_jobs(recipe: Recipe, paths: Sequence[Path], task: str | None = None) -> tuple[Recorded, ...]:
     """Every recording at or below the paths, numbered as a new dataset would number them.
 
-    Its task is ``task``, else what its ``recording.yaml`` or the calibration file says, else the name of the folder
-    that holds it, or of the file without its ending.
+    Its task is ``task``, else what its ``recording.yaml`` or the calibration file says, else what a dataset says that
+    it is an episode of, else the name of the folder that holds it, or of the file without its ending.
     """
     settings = recording_stage(recipe)
     found = []
     for path in find_recordings(paths, settings.reader, settings):
         place = Path(os.path.abspath(path))
-        name = task or _task_said(place, settings) or _task_by_place(place)
+        name = task or _task_said(place, settings) or _task_told(place, settings) or _task_by_place(place)
         if not is_plain_name(name):
             raise UsageError(f"{path}: {shown(name)} cannot be the name of a task; give one with --task")
         if not is_plain_name(place.name):
@@ -129,8 +130,19 @@ def recording_stage(recipe: Recipe) -> RecordingStage:
 
 def _task_by_place(path: Path) -> str:
     """What holds a recording: its folder, or the file that it is a part of."""
-    file, part = split_path(path)
-    return file.stem if part else file.parent.name
+    place, part = split_path(path)
+    if not part:
+        return place.parent.name
+    return place.name if place.is_dir() else place.stem
+
+
+def _task_told(path: Path, settings: RecordingSettings) -> str | None:
+    """What a dataset says is done in an episode of it, as a name."""
+    with suppress(FlowlabError):  # opening it will say what is wrong, of it alone
+        reader = choose_reader(path, settings.reader)
+        told = reader.task(path) if isinstance(reader, DatasetReader) else None
+        return file_name(told) if told else None
+    return None
 
 
 def _task_said(path: Path, settings: RecordingSettings) -> str | None:

@@ -119,17 +119,44 @@ class Reader(Protocol):
 
 @runtime_checkable
 class EpisodesReader(Reader, Protocol):
-    """A reader of files that may hold several recordings, each of which is read by a path of its own."""
+    """A reader of files or folders that may hold several recordings, each of which is read by a path of its own."""
 
     def episodes(self, path: Path, given: Metadata) -> Sequence[str]:
-        """The recordings in a file, as paths from there on; none where the file itself is one.
+        """The recordings in a file or folder, as paths from there on; none where it is one itself.
 
         Args:
-            path: The file.
+            path: The file or folder.
             given: What the user says of it.
 
         Raises:
             DataError: The file is damaged.
+        """
+        ...
+
+
+@runtime_checkable
+class DatasetReader(EpisodesReader, Protocol):
+    """A reader of folders whose files hold many recordings, and that say of each what is done in it."""
+
+    def files(self, path: Path) -> Sequence[Path]:
+        """The files that a recording is made of, by which a change of it is noticed.
+
+        Args:
+            path: The recording.
+
+        Raises:
+            DataError: The folder is damaged.
+        """
+        ...
+
+    def task(self, path: Path) -> str | None:
+        """What is done in a recording, in words; None where nothing says so.
+
+        Args:
+            path: The recording.
+
+        Raises:
+            DataError: The folder is damaged.
         """
         ...
 

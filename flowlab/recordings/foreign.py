@@ -1,6 +1,5 @@
 """Formats that are known by sight and not read: what each is, and the way on."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,14 +42,6 @@ def foreign_format(path: Path) -> str:
     return says.replace("FILE", path.name)
 
 
-def _lerobot(folder: Path) -> bool:
-    """``meta/info.json`` with a ``codebase_version``."""
-    try:
-        return "codebase_version" in json.loads((folder / "meta" / "info.json").read_bytes()[: 1 << 20])
-    except (OSError, ValueError, TypeError, RecursionError):
-        return False
-
-
 def _seven_scenes(folder: Path) -> bool:
     """``frame-000000.color.png`` and its kind, all in one folder."""
     return any(n.startswith("frame-") and n.endswith((".depth.png", ".depth.proj.png")) for n in entries(folder))
@@ -61,7 +52,6 @@ def _stray_scanner(folder: Path) -> bool:
 
 
 _FOLDERS: tuple[tuple[Callable[[Path], bool], str], ...] = (
-    (_lerobot, f"is a LeRobot data set, which is not read; {_PLAIN}"),
     (_seven_scenes, "has the layout of 7-Scenes, which is not read; move *.color.png into color/ and *.depth.png into "
                     "depth/, with a recording.yaml (depth_unit_m: 0.001, fps: 30, intrinsics)"),
     (_stray_scanner, "is of Stray Scanner, which keeps color as a video; unpack it with 'mkdir color; ffmpeg -i rgb.mp4 "  # noqa: E501

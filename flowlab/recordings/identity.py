@@ -10,13 +10,13 @@ files are not part of it, for copies have others.
 import hashlib
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
 from flowlab.errors import DataError
-from flowlab.recordings.base import choose_reader
+from flowlab.recordings.base import DatasetReader, choose_reader
 from flowlab.recordings.folder_files import FoundFile, files_below
 from flowlab.recordings.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from flowlab.recordings.parsing import RecordingSettings, known_beforehand
@@ -49,7 +49,9 @@ def identity(path: Path, settings: RecordingSettings) -> str:
     Raises:
         DataError: A file of it cannot be read.
     """
-    return f"{_digest_files(path)}/{_digest_said(path, settings)}"
+    reader = choose_reader(path, settings.reader)
+    files = [*_found(reader.files(path))] if isinstance(reader, DatasetReader) else None
+    return f"{_digest_files(path, files)}/{_digest_said(path, reader.name, settings)}"
 
 
 def difference(old: str, new: str) -> str:
@@ -75,12 +77,23 @@ def wait_until_quiet(path: Path) -> None:
         time.sleep(quiet - age)
 
 
-def _digest_files(path: Path) -> str:
-    """Of every file but those that say something of the recording, which count as they are understood."""
+def _found(files: Iterable[Path]) -> Iterator[FoundFile]:
+    """Files that are there."""
+    for file in files:
+        yield from files_below(file)
+
+
+def _digest_files(path: Path, files: Iterable[FoundFile] | None) -> str:
+    """Of every file but those that say something of the recording, which count as they are understood.
+
+    Args:
+        path: The recording.
+        files: Those that it is made of, where its reader says so; else all that are in its folder.
+    """
     digest = hashlib.blake2b(digest_size=16)
     path, inside = split_path(path)
     digest.update(inside.encode("utf-8", "replace"))
-    for file in files_below(path):
+    for file in files_below(path) if files is None else files:
         if file.name == FILE_NAME:
             continue
         digest.update(f"{file.name if path.is_dir() else file.path.suffix}\0{file.size}\0".encode("utf-8", "replace"))
@@ -119,8 +132,8 @@ def _whole(path: Path, *state: int) -> bytes:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def _digest_said(path: Path, settings: RecordingSettings) -> str:
+def _digest_said(path: Path, reader: str, settings: RecordingSettings) -> str:
     """Of what the user says of a recording, but for its task, by which the dataset knows it anyway."""
     said = known_beforehand(path, settings).model_dump(mode="json", exclude_defaults=True, exclude={"task"})
-    text = json.dumps([choose_reader(path, settings.reader).name, said], sort_keys=True)
+    text = json.dumps([reader, said], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()

@@ -1,8 +1,11 @@
-"""A recording that is a part of a file, as one episode of many is: ``demos.hdf5/data/demo_3``."""
+"""A recording that is a part of a file or of a dataset, as one episode of many is: ``demos.hdf5/data/demo_3``."""
 
 from pathlib import Path
 
 from flowlab.untrusted import is_there
+
+FOLDER_INDEX = "meta/info.json"
+"""What a folder has whose recordings lie together in its files, as those of LeRobot do."""
 
 
 def split_path(path: Path) -> tuple[Path, str]:
@@ -18,7 +21,8 @@ def split_path(path: Path) -> tuple[Path, str]:
     if not is_there(path):
         for above in path.parents:
             if is_there(above):
-                return (above, path.relative_to(above).as_posix()) if above.is_file() else (path, "")
+                holds = above.is_file() or is_there(above / FOLDER_INDEX)
+                return (above, path.relative_to(above).as_posix()) if holds else (path, "")
     return path, ""
 
 

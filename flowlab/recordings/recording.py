@@ -125,7 +125,7 @@ def _below(path: Path, readers: tuple[Reader, ...], above: frozenset[Path] = fro
 def _episodes(path: Path, readers: tuple[Reader, ...], settings: RecordingSettings) -> list[Path]:
     """The recordings in a file that holds several; the file itself where that is not clear, so that opening tells."""
     reader = next(r for r in readers if recognizes(r, path))
-    if not isinstance(reader, EpisodesReader) or not path.is_file():
+    if not isinstance(reader, EpisodesReader) or not path.exists():
         return [path]
     try:
         return [path / name for name in reader.episodes(path, known_beforehand(path, settings))] or [path]

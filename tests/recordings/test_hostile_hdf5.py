@@ -25,7 +25,7 @@ from synthetic import call_cli
 from flowlab.errors import DataError
 from flowlab.limits import MAX_READER_BYTES
 from flowlab.recordings.base import BadImage, choose_reader, read_streams
-from flowlab.recordings.readers import hdf5_process
+from flowlab.recordings.readers import hdf5_process, helper_process
 from flowlab.recordings.recording_yaml import Metadata
 
 DEMO, DEPTH, COLOR = "data/demo_0", "data/demo_0/obs/agentview_depth", "data/demo_0/obs/agentview_image"
@@ -234,7 +234,7 @@ def test_a_file_that_makes_the_library_loop_is_refused_once_and_for_all(
     size = content.index(b"GCOL") + 24
     content[size : size + 8] = (2**64 - 16).to_bytes(8, "little")
     path.write_bytes(content)
-    monkeypatch.setattr(hdf5_process, "_PATIENCE_S", 1.0)
+    monkeypatch.setattr(helper_process, "PATIENCE_S", 1.0)
     for _ in range(2):
         start = time.monotonic()
         with pytest.raises(DataError, match=r"does not come to an end in 1 s on it, so it is damaged.*h5repack"):
@@ -246,7 +246,7 @@ def test_a_file_that_makes_the_library_loop_is_refused_once_and_for_all(
 def test_a_crash_of_the_library_is_told(tmp_path: Path) -> None:
     path = robomimic(tmp_path / "d.hdf5", demos=1)
     streams = read_streams(choose_reader(path), path, Metadata(fps=20))
-    pid = hdf5_process._HELPERS[0]._process.pid
+    pid = helper_process.HELPERS[hdf5_process._SERVE]._process.pid
     os.kill(pid, signal.SIGSTOP)
     threading.Timer(0.2, lambda: [os.kill(pid, s) for s in (signal.SIGSEGV, signal.SIGCONT)]).start()
     with pytest.raises(BadImage, match="crashes on it"):

@@ -14,6 +14,7 @@ from real_recordings import INTRINSICS, STEPS, colors, counts, write_folder, wri
 from flowlab.recordings.base import BadImage, ImageStream, Reader, Streams
 from flowlab.recordings.readers.arrays import ArraysReader
 from flowlab.recordings.readers.hdf5 import HDF5Reader
+from flowlab.recordings.readers.lerobot import LeRobotReader
 from flowlab.recordings.readers.plain import PlainReader
 from flowlab.recordings.readers.realsense import RealSenseReader
 from flowlab.recordings.readers.rh20t import RH20TReader
@@ -83,6 +84,18 @@ def hdf5(folder: Path) -> Path:
     return robomimic(folder / "demos.hdf5", demos=1)
 
 
+def lerobot(folder: Path) -> Path:
+    from lerobot_files import v3
+
+    return v3(folder / "d", demos=1, color="png", depth="tiff")
+
+
+def lerobot_videos(folder: Path) -> Path:
+    from lerobot_files import v21
+
+    return v21(folder / "d", demos=1, depth="video")
+
+
 def realsense(folder: Path) -> Path:
     pytest.importorskip("open3d")
     from test_realsense_reader import write_sdk_bag
@@ -99,6 +112,8 @@ RECORDINGS: tuple[tuple[MakeReader, Callable[[Path], Path]], ...] = (
     (ROSReader, ros_bag),
     (ROSReader, ros_folder),
     (HDF5Reader, hdf5),
+    (LeRobotReader, lerobot),
+    (LeRobotReader, lerobot_videos),
     pytest.param(RealSenseReader, realsense, marks=pytest.mark.slow),  # type: ignore[arg-type]
 )
 

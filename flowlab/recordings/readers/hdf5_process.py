@@ -7,24 +7,18 @@ pipe, and is ended when it does not answer.
 
 import importlib.util
 import os
-import pickle
-import select
-import subprocess
-import sys
-import threading
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowlab.errors import DataError, MissingLibraryError
+from flowlab.errors import MissingLibraryError
 from flowlab.recordings.readers.hdf5_array import HDF5Array
+from flowlab.recordings.readers.helper_process import FileWords, answer_requests, ask_of_file
 from flowlab.untrusted import check_regular
 
-_PATIENCE_S = 60.0
-"""An answer takes milliseconds, that of a long list seconds [s]."""
 _ANY_SIZE = 1 << 60
-_START = "from flowlab.recordings.readers.hdf5_process import serve; serve()"
-_MEND = "copy it again, or mend it with 'h5repack OLD NEW' if that can read it"
+_SERVE = "flowlab.recordings.readers.hdf5_process:serve"
+_WORDS = FileWords("the HDF5 library", "copy it again, or mend it with 'h5repack OLD NEW' if that can read it")
 
 
 class HDF5Access:
@@ -67,92 +61,30 @@ class HDF5Access:
 
     def _ask(self, what: str, *arguments: Any) -> Any:
         """The answer of the other process. Raises :class:`DataError` where it has none."""
-        place = str(self.path.absolute())
-        if (place, self._changed) not in _REFUSED:
-            try:
-                found, value = _helper().ask((place, what, arguments))
-            except _NoAnswerError as error:
-                _REFUSED[place, self._changed] = str(error)
-            else:
-                if found:
-                    return value
-                raise DataError(value.replace(place, str(self.path)))
-        how = _REFUSED[place, self._changed]
-        raise DataError(f"{self.path}: the HDF5 library {how} on it, so it is damaged or made to do that; {_MEND}")
-
-
-class _NoAnswerError(Exception):
-    """Raised where the other process hangs or dies; the message says which."""
-
-
-class _Helper:
-    """The other process."""
-
-    def __init__(self) -> None:
-        env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "HDF5_PLUGIN_PRELOAD": "::"}
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL, env=env,
-        )  # fmt: skip
-        self._owner, self._lock = os.getpid(), threading.Lock()
-
-    @property
-    def is_mine(self) -> bool:
-        """Whether it lives, and answers to this process and no copy of it."""
-        return self._owner == os.getpid() and self._process.poll() is None
-
-    def ask(self, request: Any) -> tuple[bool, Any]:
-        """Whether there is an answer, and that or what is wrong. Raises :class:`_NoAnswerError`."""
-        with self._lock:
-            given, told = self._process.stdin, self._process.stdout
-            assert given is not None
-            assert told is not None
-            try:
-                pickle.dump(request, given)
-                given.flush()
-                if select.select([told], [], [], _PATIENCE_S)[0]:
-                    answer: tuple[bool, Any] = pickle.load(told)
-                    return answer
-                how = f"does not come to an end in {_PATIENCE_S:.0f} s"
-            except (OSError, EOFError, pickle.UnpicklingError):
-                how = "crashes"
-            self._process.kill()
-            self._process.wait()
-        raise _NoAnswerError(how)
-
-
-_REFUSED: dict[tuple[str, int], str] = {}
-"""Files on which the library hangs or crashes, by path and time of change: none is waited for twice."""
-_HELPERS: list[_Helper] = []
-
-
-def _helper() -> _Helper:
-    """The one of this process, started when it is first needed, and again when it had to be ended."""
-    if not (_HELPERS and _HELPERS[0].is_mine):
-        _HELPERS[:] = [_Helper()]
-    return _HELPERS[0]
+        return ask_of_file(_SERVE, self.path, self._changed, what, arguments, words=_WORDS)
 
 
 def serve() -> None:
     """Answer requests until there are no more: what the other process does."""
-    opened: _Opened | None = None
-    while True:
-        try:
-            path, what, arguments = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
-        try:
-            about = os.stat(path)
-            state = path, about.st_mtime_ns, about.st_size, about.st_ino
-            if opened is None or opened.state != state:
-                if opened is not None:
-                    opened.file.close()  # else the library takes a file that was written anew for the old one
-                opened = _Opened(state)
-            answer = True, opened.answer(what, arguments)
-        except Exception as error:
-            answer = False, str(error)
-        pickle.dump(answer, sys.stdout.buffer, protocol=5)
-        sys.stdout.buffer.flush()
+    answer_requests(_Server().answer)
+
+
+class _Server:
+    """What the other process has: the file that was asked for last."""
+
+    def __init__(self) -> None:
+        self._opened: _Opened | None = None
+
+    def answer(self, request: tuple[str, str, tuple[Any, ...]]) -> Any:
+        """What a file says."""
+        path, what, arguments = request
+        about = os.stat(path)
+        state = path, about.st_mtime_ns, about.st_size, about.st_ino
+        if self._opened is None or self._opened.state != state:
+            if self._opened is not None:
+                self._opened.file.close()  # else the library takes a file that was written anew for the old one
+            self._opened = _Opened(state)
+        return self._opened.answer(what, arguments)
 
 
 class _Opened:
