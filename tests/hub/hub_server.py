@@ -5,11 +5,20 @@ import hashlib
 import json
 import re
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
+
+import pytest
+
+from flowlab.cli import main
 
 TOKEN = "hf_standin"
 Files = dict[str, bytes]
@@ -188,7 +197,7 @@ class _Handler(BaseHTTPRequestHandler):
         if key in self.server.repos:
             self._json({"error": "You already created this repo", "url": url}, 409)
             return
-        self.server.repos[key] = Repo(private=bool(about.get("private")))
+        self.server.repos[key] = Repo(private="private" in (about.get("visibility"), about.get("private") and "private"))
         self.server.repos[key].commit({".gitattributes": b"*.zip filter=lfs\n"})
         self._json({"url": url, "name": about["name"], "id": "1"})
 
@@ -254,3 +263,27 @@ _ROUTES: list[tuple[str, Callable[..., None]]] = [
     (r"/((?:datasets/)?[\w.-]+/[\w.-]+)\.git/info/lfs/objects/batch", _Handler.lfs_batch),
     (r"/lfs/(\w+)", _Handler.lfs_put),
 ]
+
+
+@contextmanager
+def standing_in(patch: pytest.MonkeyPatch, home: Path) -> Iterator[HubServer]:
+    """A Hub that flowlab takes for the real one, and a login for it."""
+    server = HubServer()
+    patch.setenv("HF_ENDPOINT", server.endpoint)
+    patch.setenv("HF_TOKEN", TOKEN)
+    patch.setenv("FLOWLAB_CACHE", str(home / "cache"))
+    patch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(home / "no-token"))
+    clock = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: None})  # it tries again after a while
+    patch.setattr("huggingface_hub.utils._http.time", clock)
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def uploaded(patch: pytest.MonkeyPatch, path: Path, home: Path, *options: str) -> Files:
+    """What a push of something uploads."""
+    with standing_in(patch, home) as server, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        main("hub", "push", str(path), "anna/it", "--yes", *options)
+        return server.files(next(iter(server.repos)))
