@@ -13,6 +13,7 @@ from typing import Any
 from flowlab.text import cut
 
 _ROOTS = ("home", "Users", "root", "tmp", "mnt", "media", "var", "opt", "srv", "scratch", "Volumes", "private")
+_HOMES = ("home", "Users")
 _KNOWN = {"source", "films", "labeled", "dataset"}
 """Keys whose values are paths and nothing else."""
 _ABSOLUTE = re.compile(r"/|~|\.\.[\\/]|[A-Za-z]:[\\/]|\\\\|file:")
@@ -33,7 +34,11 @@ def _local() -> re.Pattern[str]:
 def _last_name(path: str) -> str:
     """The last name of a path; nothing of one that is hardly more than somebody's home."""
     parts = PureWindowsPath(path.removeprefix("file://")).parts  # takes both kinds of separators
-    return parts[-1] if len(parts) > 3 or parts[:1] == ("..",) else _HIDDEN
+    if parts[0][0] in "~.":
+        least = 2
+    else:
+        least = 4 if parts[1] in _HOMES else 3
+    return parts[-1] if len(parts) >= least else _HIDDEN
 
 
 def without_local_paths(values: Any, where: str = "") -> tuple[Any, list[str]]:

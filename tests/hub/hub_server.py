@@ -61,7 +61,7 @@ class HubServer(ThreadingHTTPServer):
         self.uses_lfs = False
         self.stored: Files = {}
         """What came through LFS, by SHA-256."""
-        threading.Thread(target=self.serve_forever, daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
 
     @property
     def endpoint(self) -> str:
@@ -197,7 +197,9 @@ class _Handler(BaseHTTPRequestHandler):
         if key in self.server.repos:
             self._json({"error": "You already created this repo", "url": url}, 409)
             return
-        self.server.repos[key] = Repo(private="private" in (about.get("visibility"), about.get("private") and "private"))
+        self.server.repos[key] = Repo(
+            private="private" in (about.get("visibility"), about.get("private") and "private")
+        )
         self.server.repos[key].commit({".gitattributes": b"*.zip filter=lfs\n"})
         self._json({"url": url, "name": about["name"], "id": "1"})
 
