@@ -42,15 +42,7 @@ def _last_name(path: str) -> str:
 
 
 def without_local_paths(values: Any, where: str = "") -> tuple[Any, list[str]]:
-    """JSON values in which local paths are cut to their last names.
-
-    Args:
-        values: What was read from JSON, or is to be written as such.
-        where: What the values are called.
-
-    Returns:
-        The values, and the places in them that are others now: ``recordings.source``.
-    """
+    """JSON values, called ``where``, in which local paths are cut to their last names; and the places of these."""
     found: dict[str, None] = {}
 
     def clean(value: Any, key: str, place: str) -> Any:
