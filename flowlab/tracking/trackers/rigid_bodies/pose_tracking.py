@@ -6,18 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Int32
 
-from flowlab.tracking.trackers.rigid_bodies import _costs, _gauss_newton
+from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch, rotate
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid, nearest_rotation
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid
 
 _POINTS_PER_BODY = 400
 """Points a body is tracked by."""
-_ITERATIONS = 6
-"""Of Gauss-Newton, for every frame."""
 _HIGH_ENERGY, _ENERGY_RISE = 0.4, 0.05
 """An energy above this, or this much above the last frame's, calls for a wider search."""
-_MAX_STEP_M, _STEP_PENALTY = 0.15, 10.0
-"""Nothing moves farther than this from one frame to the next [m]."""
 _LOST, _GOOD = 0.4, 0.6
 """Energies above which a body is lost, and below which another may hold it."""
 _SHIFTS = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.0)
@@ -38,51 +34,6 @@ class RigidBody:
     """Cells of the grid it was last fitted to."""
 
 
-class _BodyBatch:
-    """Some bodies, as arrays that compiled code takes; B bodies of n points."""
-
-    def __init__(
-        self, pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator, points: int
-    ) -> None:
-        self.pictures = pictures
-        chosen = [b.pixels[_sample(len(b.pixels), points, rng)] for b in bodies]
-        uv = np.stack(chosen)
-        z = pictures.smooth[0, uv[..., 1], uv[..., 0]].astype(float)
-        self.points = pictures.unproject(uv.astype(float), z)
-        flat = uv.reshape(-1, 2).astype(np.float32)
-        self.features = _costs.features_at(pictures.feature[0], flat).reshape(*uv.shape[:2], 4)
-        self.lightness = self.features[..., 1].astype(float)
-        self.center = self.points.mean(1)
-        self.last_center = self.center
-        """Where the bodies' centers (B, 3) [m] were in the frame before the one looked at."""
-
-    def energies(
-        self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Energy and seen share (B', C) of candidate poses (B', C, 3, 3), (B', C, 3) in frame t."""
-        p = self.pictures
-        energy, seen = _costs.energies(self.points[of], self.features[of], R, s, p.depth[t], p.feature[t], p.K, every)
-        leap = np.linalg.norm(_rotate(R, self.center[of][:, None]) + s - self.last_center[of][:, None], axis=-1)
-        return energy + _STEP_PENALTY * (leap > _MAX_STEP_M), seen
-
-    def align(
-        self, t: int, R: np.ndarray, s: np.ndarray, lightness: np.ndarray, of: np.ndarray | slice = slice(None)
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (B', 3, 3), (B', 3) refined on frame t, whose lightness is given."""
-        p = self.pictures
-        R, s = _gauss_newton.align(
-            self.points[of], self.lightness[of], R, s, lightness, p.smooth[t], p.normal[t], p.K, _ITERATIONS
-        )
-        return nearest_rotation(R), s
-
-
-def _sample(n: int, points: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of the pixels a body of n is tracked by."""
-    if n == points:
-        return np.arange(n)
-    return rng.choice(n, points, replace=n < points)
-
-
 def track_poses(
     pictures: ClipFeatures, bodies: Sequence[RigidBody], rng: np.random.Generator, points: int = _POINTS_PER_BODY
 ) -> list[RigidBody]:
@@ -99,12 +50,12 @@ def track_poses(
     """
     if not bodies:
         return []
-    batch, frames, count = _BodyBatch(pictures, bodies, rng, points), len(pictures), len(bodies)
+    batch, frames, count = BodyBatch(pictures, [b.pixels for b in bodies], rng, points), len(pictures), len(bodies)
     R, s = np.tile(np.eye(3), (frames, count, 1, 1)), np.zeros((frames, count, 3))
     energy = np.zeros(count)
     seen_R, seen_s = R[0].copy(), s[0].copy()
     for t in range(1, frames):
-        batch.last_center = _rotate(R[t - 1], batch.center) + s[t - 1]
+        batch.last_center = rotate(R[t - 1], batch.center) + s[t - 1]
         poses = _easy_guesses(bodies, t, R, s, (seen_R, seen_s))
         if pictures.still is not None:
             poses = _with_stillness(pictures.still, t, R[t - 1], s[t - 1], poses)
@@ -118,6 +69,7 @@ def track_poses(
         R[t], s[t], energy = best.R, best.s, best.energy
         good = (best.seen > 0.4) & (energy < 0.5)
         seen_R[good], seen_s[good] = R[t, good], s[t, good]
+        batch.turn(np.flatnonzero(best.seen > 0.4), R[t], s[t])
     return [replace(b, motion=RigidMotion(R[:, k], s[:, k])) for k, b in enumerate(bodies)]
 
 
@@ -127,7 +79,7 @@ def _with_stillness(
     """Poses to try, and those of bodies that stay where they were in the frame before, though the camera moves."""
     R_step = still.R[t] @ still.R[t - 1].T
     s_step = still.t[t] - R_step @ still.t[t - 1]
-    R, s = R_step @ last_R, _rotate(R_step, last_s) + s_step
+    R, s = R_step @ last_R, rotate(R_step, last_s) + s_step
     return np.concatenate([poses[0], R[:, None]], 1), np.concatenate([poses[1], s[:, None]], 1)
 
 
@@ -138,12 +90,12 @@ def _easy_guesses(
     seen well, that to which its last step leads again, and that of its proposal."""
     before = max(t - 2, 0)
     R_step = R[t - 1] @ R[before].swapaxes(1, 2)
-    s_step = s[t - 1] - _rotate(R_step, s[before])
+    s_step = s[t - 1] - rotate(R_step, s[before])
     guess_R = np.stack([b.motion.R[t] if b.guessed[t] else R[t - 1, k] for k, b in enumerate(bodies)])
     guess_s = np.stack([b.motion.t[t] if b.guessed[t] else s[t - 1, k] for k, b in enumerate(bodies)])
     return (
         np.stack([R[t - 1], seen[0], R_step @ R[t - 1], guess_R], 1),
-        np.stack([s[t - 1], seen[1], _rotate(R_step, s[t - 1]) + s_step, guess_s], 1),
+        np.stack([s[t - 1], seen[1], rotate(R_step, s[t - 1]) + s_step, guess_s], 1),
     )
 
 
@@ -172,11 +124,6 @@ class _BestPoses:
         return take
 
 
-def _rotate(R: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) turned by rotations (..., 3, 3)."""
-    return (R @ s[..., None])[..., 0]
-
-
 def _choose(
     valued: tuple[np.ndarray, np.ndarray], R: np.ndarray, s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -187,7 +134,7 @@ def _choose(
 
 
 def _evaluate(
-    batch: _BodyBatch, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None)
+    batch: BodyBatch, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Poses with their energies and seen shares."""
     energy, seen = batch.energies(t, R[:, None], s[:, None], of)
@@ -195,12 +142,12 @@ def _evaluate(
 
 
 def _search(
-    batch: _BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
+    batch: BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
 ) -> None:
     """For bodies that no easy guess explains: optical flow of their own points, and shifts in the picture."""
     flow_R, flow_s = _by_flow(batch, t, best, hard, last_R, last_s)
     best.try_poses(hard, *_evaluate(batch, t, flow_R, flow_s, hard), slack=0)
-    depth = _rotate(best.R[hard], batch.center[hard])[:, 2] + best.s[hard, 2]
+    depth = rotate(best.R[hard], batch.center[hard])[:, 2] + best.s[hard, 2]
     fan = _FAN_PX / batch.pictures.K[0, 0] * depth[:, None, None]
     R = np.concatenate([np.repeat(x[hard][:, None], len(_FAN_PX), 1) for x in (best.R, last_R)], 1)
     s = np.concatenate([x[hard][:, None] + fan for x in (best.s, last_s)], 1)
@@ -209,7 +156,7 @@ def _search(
 
 
 def _by_flow(
-    batch: _BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
+    batch: BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The poses that optical flow of the points seen in the last frame asks for; the best where it asks for none."""
     R, s = best.R[hard].copy(), best.s[hard].copy()
@@ -251,7 +198,7 @@ def _carried_by_flow(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> tuple[n
 
 
 def _borrow_motions(
-    batch: _BodyBatch, t: int, best: _BestPoses, last_R: np.ndarray, last_s: np.ndarray, lightness: np.ndarray
+    batch: BodyBatch, t: int, best: _BestPoses, last_R: np.ndarray, last_s: np.ndarray, lightness: np.ndarray
 ) -> None:
     """A body that is lost may be held by one that is not: let it try the others' motions since the last frame."""
     lost = np.flatnonzero((best.energy > _LOST) | (best.seen < 0.35))
@@ -259,9 +206,9 @@ def _borrow_motions(
     if not (len(lost) and len(good)):
         return
     R_step = best.R[good] @ last_R[good].swapaxes(1, 2)
-    s_step = best.s[good] - _rotate(R_step, last_s[good])
+    s_step = best.s[good] - rotate(R_step, last_s[good])
     R = R_step[None] @ last_R[lost][:, None]
-    s = _rotate(R_step[None], last_s[lost][:, None]) + s_step
+    s = rotate(R_step[None], last_s[lost][:, None]) + s_step
     found = _choose(batch.energies(t, R, s, lost), R, s)
     taken = best.try_poses(lost, *found, slack=-0.01)
     if len(taken):
