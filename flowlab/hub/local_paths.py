@@ -34,10 +34,7 @@ def _local() -> re.Pattern[str]:
 def _last_name(path: str) -> str:
     """The last name of a path; nothing of one that is hardly more than somebody's home."""
     parts = PureWindowsPath(path.removeprefix("file://")).parts  # takes both kinds of separators
-    if parts[0][0] in "~.":
-        least = 2
-    else:
-        least = 4 if parts[1] in _HOMES else 3
+    least = 2 if parts[0][0] in "~." else 4 if parts[1] in _HOMES else 3
     return parts[-1] if len(parts) >= least else _HIDDEN
 
 

@@ -87,7 +87,7 @@ DATASETS: dict[str, tuple[Callable[[Files], Files], str]] = {
     "hidden": (lambda f: {**f, "receipts/.x.json": b"{}"}, "has a file called 'receipts/.x.json'"),
     "escapes the terminal": (lambda f: {**f, "receipts/\x1b[2Jx.json": b"{}"}, "has a file called"),
     "no shard": (lambda f: {n: c for n, c in f.items() if n != SHARD}, f"lacks {SHARD}"),
-    "one shard too many": (lambda f: {**f, "shards/x.zarr.zip": b"x"}, "has shards/x.zarr.zip, which no receipt counts"),
+    "one shard too many": (lambda f: {**f, "shards/x.zarr.zip": b"x"}, "shards/x.zarr.zip, which no receipt counts"),
     "manifest is a link": (lambda f: {**f, "flowlab.json": b"/etc/passwd"}, "not valid JSON"),
     "manifest is nested": (lambda f: {**f, "flowlab.json": b"[" * 100_000}, "nested too deep"),
     "task leads out": (
