@@ -1,9 +1,10 @@
 """A policy as it goes to the Hub, and as it comes from there: settings in JSON, weights in safetensors, no code."""
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from flowlab.checksums import with_checksum
+from flowlab.checksums import with_checksum, without_checksum
 from flowlab.errors import DataError
 from flowlab.files import write_atomically, write_json
 from flowlab.hub.cards import policy_page
@@ -23,6 +24,7 @@ from flowlab.policies.checkpoint import (
 )
 from flowlab.policies.run_folder import read_run_config
 from flowlab.policies.tensor_files import check_finite
+from flowlab.untrusted import read_json
 from flowlab.viz.training_metrics import METRICS
 
 
@@ -41,9 +43,10 @@ def stage_policy(path: Path, folder: Path, name: HubName, license_name: str | No
     loaded = load_policy(path)
     run = loaded.path.absolute().parents[1]
     sources = _sources(run)
-    trained = loaded.trained.model_copy(update={"dataset": ", ".join(sources) or _last_names(loaded.trained.dataset)})
-    trained = trained.model_copy(update={"license": license_name} if license_name else {})
-    values = json.loads(trained.model_dump_json())
+    said = {"dataset": ", ".join(sources) or _last_names(loaded.trained.dataset)}
+    said |= {"license": license_name} if license_name else {}
+    values = _said_otherwise(run / POLICY, said)
+    trained = loaded.trained.model_copy(update=said)
     if places := without_local_paths(values)[1]:
         raise DataError(
             f"{run / POLICY}: {places[0]} is a local path, without which the policy does not load, and with which it "
@@ -56,6 +59,12 @@ def stage_policy(path: Path, folder: Path, name: HubName, license_name: str | No
     write_atomically(folder / CARD, policy_page(name, trained, loaded.step, on_hub, picture=picture))
     changed = ("dataset",) if trained.dataset != loaded.trained.dataset else ()
     return Staged(trained.license, changed, fingerprint=trained.fingerprint)
+
+
+def _said_otherwise(path: Path, said: Mapping[str, str]) -> dict[str, Any]:
+    """What ``policy.json`` says, as its weights know it, but for what may be said otherwise."""
+    values = without_checksum(read_json(path), path, "restore it")
+    return {**{name: value for name, value in values.items() if name != "hub"}, **said}
 
 
 def _sources(run: Path) -> list[str]:
@@ -90,10 +99,10 @@ def finish_policy(fetched: Path, folder: Path, where: HubName) -> None:
     Raises:
         DataError: It is damaged, not flowlab's, or a policy that is not installed here.
     """
-    trained = validated(TrainedPolicy, fetched / CONFIG).model_copy(update={"hub": str(where)})
+    validated(TrainedPolicy, fetched / CONFIG)
     weights = folder / CHECKPOINTS / checkpoint_name(step_of(fetched / WEIGHTS))
     weights.parent.mkdir()
-    write_json(folder / POLICY, with_checksum(json.loads(trained.model_dump_json())))
+    write_json(folder / POLICY, with_checksum(_said_otherwise(fetched / CONFIG, {"hub": str(where)})))
     (fetched / WEIGHTS).rename(weights)
     check_finite(weights, load_policy(weights).policy.state_dict())
 

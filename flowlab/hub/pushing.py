@@ -78,12 +78,13 @@ def planned_push(path: Path, repo: str, license_name: str | None = None) -> Iter
             f"--license {shown(license_name)}: is no license as the Hub names them, such as cc-by-4.0, mit or other"
         )
     kind = kind_of(path)
-    with TemporaryDirectory(prefix="flowlab-push-") as temporary, told_when_unwritable(Path(temporary), "make room"):
+    with TemporaryDirectory(prefix="flowlab-push-") as temporary:
         folder = Path(temporary)
-        if kind == "dataset":
-            staged = stage_dataset(Dataset(path), folder, name, license_name)
-        else:
-            staged = stage_policy(path, folder, name, license_name)
+        with told_when_unwritable(folder, "make room"):
+            if kind == "dataset":
+                staged = stage_dataset(Dataset(path), folder, name, license_name)
+            else:
+                staged = stage_policy(path, folder, name, license_name)
         sizes = {str(f.relative_to(folder)): f.stat().st_size for f in sorted(folder.rglob("*")) if f.is_file()}
         check_counts(sizes, str(path))
         yield PlannedPush(kind, name, folder, sizes, staged, _told_in(folder, sizes), _left_out(path, sizes))

@@ -276,7 +276,8 @@ def standing_in(patch: pytest.MonkeyPatch, home: Path) -> Iterator[HubServer]:
     patch.setenv("FLOWLAB_CACHE", str(home / "cache"))
     patch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(home / "no-token"))
     clock = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: None})  # it tries again after a while
-    patch.setattr("huggingface_hub.utils._http.time", clock)
+    for module in ("utils._http", "file_download"):
+        patch.setattr(f"huggingface_hub.{module}.time", clock)
     try:
         yield server
     finally:
