@@ -15,7 +15,7 @@ from flowlab.hub.names import HubName, Kind
 from flowlab.hub.published_dataset import Staged, stage_dataset
 from flowlab.hub.published_policy import stage_policy
 from flowlab.hub.repo_layout import check_counts, matches, our_patterns
-from flowlab.policies.checkpoint import POLICY
+from flowlab.policies.checkpoint import CHECKPOINTS, POLICY
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import MANIFEST
 from flowlab.text import shown
@@ -120,5 +120,5 @@ def _told_in(folder: Path, sizes: Mapping[str, int]) -> tuple[str, ...]:
 
 def _left_out(path: Path, sizes: Mapping[str, int]) -> tuple[str, ...]:
     """Files and folders beside what is pushed that stay here."""
-    going = {name.partition("/")[0] for name in sizes}
+    going = {name.partition("/")[0] for name in sizes} | {POLICY, CHECKPOINTS}  # which go by other names
     return tuple(sorted(p.name for p in path.iterdir() if p.name not in going)) if path.is_dir() else ()

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 from hub_server import HubServer, standing_in
-from synthetic import SETTINGS, call_cli, make_dataset, make_episode
+from synthetic import SETTINGS, call_cli, make_dataset, make_episode, make_provenance
 
 from flowlab.hub.local_paths import told_names, without_local_paths
 from flowlab.storage.dataset import Dataset
+from flowlab.storage.merging import merge
 from flowlab.storage.recorded import Recorded
 
 SECRET = "/home/joe bloggs/robots"
@@ -51,6 +52,18 @@ def test_names_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("socket.gethostname", lambda: "zeppelin7")
     assert told_names("made on zeppelin7.") == ["zeppelin7"]
     assert told_names("zeppelin70") == []
+
+
+def test_a_merged_dataset_has_the_license_that_all_have(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    places = []
+    for k, name in enumerate(("mit", "mit", "cc-by-4.0")):
+        about = make_provenance(license=name, hub=f"anna/d{k}@{'0' * 40}")
+        places.append(make_dataset(tmp_path / f"d{k}", [[make_episode(k)]], provenance=about).path)
+    same, other = merge(places[:2], tmp_path / "same"), merge(places[1:], tmp_path / "other")
+    assert (same.provenance.license, same.provenance.hub) == ("mit", "")
+    assert other.provenance.license == ""
+    assert "licenses differ" in caplog.text
+    assert [d["license"] for d in other.manifest.settings["merge"]["of"]] == ["mit", "cc-by-4.0"]
 
 
 def test_a_dataset_goes_without_the_paths_of_its_machine(
