@@ -6,11 +6,11 @@ dataset card. Nobody asks for the name of a stage.
 
 import json
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, NonNegativeInt, model_validator
 
-from flowlab.config import Settings
+from flowlab.config import Settings, later
 from flowlab.text import cut, shown
 
 
@@ -99,6 +99,10 @@ class Provenance(Settings):
     """Name of what estimated them."""
     inferred: Inferred | None = None
     """What of state and action was inferred from motion; None where all was recorded or simulated."""
+    license: Annotated[str, later("")] = ""
+    """Under which others may use it, as the Hugging Face Hub names licenses; empty where nobody has said."""
+    hub: Annotated[str, later("")] = ""
+    """Where on the Hub it was pulled from, with the commit: ``user/name@commit``; empty where it was not."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:

@@ -32,6 +32,7 @@ _COMMANDS = {
     "merge": ("flowlab.cli.selection:merge", "Make one dataset of several."),
     "subset": ("flowlab.cli.selection:subset", "Make a dataset of some tasks or episodes of another one."),
     "split": ("flowlab.cli.selection:split", "Make two datasets of one, to train and to validate on."),
+    "hub": ("flowlab.cli.hub:hub", "Share datasets and policies on the Hugging Face Hub: push, pull."),
     "export": ("flowlab.cli.datasets:export", "Write a dataset in another tool's layout."),
     "doctor": ("flowlab.cli.doctor:doctor", "Say what this machine has of what flowlab can use."),
     "plugins": ("flowlab.cli.plugins:plugins", "List trackers, readers, stages, policies and more, and from where."),

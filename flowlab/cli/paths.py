@@ -12,7 +12,14 @@ from flowlab.text import shown
 class _Path(click.Path):
     """A path that is text and that a file system can have, there or not; another is told before it is looked for."""
 
+    def __init__(self, *, on_hub: bool = False) -> None:
+        super().__init__(path_type=Path)
+        self._on_hub = on_hub
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not self._on_hub and str(value).startswith("hub:") and not os.path.lexists(value):
+            name = shown(str(value))
+            self.fail(f"{name}: only 'flowlab train' takes names on the Hub; 'flowlab hub pull' it first", param, ctx)
         try:
             os.path.abspath(value).encode()  # whatever keeps a path, keeps it as text
             os.lstat(value)
@@ -24,5 +31,7 @@ class _Path(click.Path):
         return super().convert(value, param, ctx)
 
 
-PATH = _Path(path_type=Path)
+PATH = _Path()
 """The type of all arguments and options that are files or folders."""
+PATH_OR_HUB = _Path(on_hub=True)
+"""The same, where a dataset on the Hub may be named, too: ``hub:user/name``."""

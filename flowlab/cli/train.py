@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from flowlab.cli.console import STEPS_LINE, ProgressBar, echo, print_json, print_table, say, show_training
-from flowlab.cli.paths import PATH
+from flowlab.cli.paths import PATH, PATH_OR_HUB
 from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
@@ -32,7 +32,7 @@ class PluginOption(click.Option):
 
 
 @click.command()
-@click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
+@click.argument("sources", type=PATH_OR_HUB, nargs=-1, required=True, metavar="SOURCE...")
 @click.option("--policy", cls=PluginOption, registry=POLICIES, help="What to train.")
 @click.option("--out", type=PATH, help="Folder of the run.")
 @click.option("--profile", help="fast, paper, or a YAML file with the settings that differ  [fast].")
@@ -72,11 +72,13 @@ def train(
       flowlab train data/push --policy fdp --out runs/push-fdp
       flowlab train data/push --policy dp3 --profile paper --out runs/push-dp3
       flowlab train data/push data/films-labeled --policy dp3 --out runs/push-all
+      flowlab train hub:user/pour@1.0 --policy fdp --out runs/pour-fdp
       flowlab train runs/push-fdp --resume
       torchrun --nproc-per-node 4 -m flowlab train data/push --policy fdp --out runs/push-fdp
 
     SOURCE is what extract-sim, track-real or label-actions made, or, for dp3, a store in DP3's layout. Several datasets
-    must say the same of their frame, their camera, and what their numbers mean.
+    must say the same of their frame, their camera, and what their numbers mean. hub:user/name is a dataset on the
+    Hugging Face Hub, which is pulled into the cache first; 'flowlab hub pull' does it without training.
 
     --minutes is CPU time of one thread, so that what else the machine does changes nothing; on a GPU it is time by
     the clock. The learning rate falls to zero within it.

@@ -1,9 +1,7 @@
 """Everything that would spoil the use of a training run, found before it does."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-
-import torch
 
 from flowlab.checksums import CHECKSUM
 from flowlab.data.source import open_training_source
@@ -21,10 +19,10 @@ from flowlab.policies.checkpoint import (
     warn_of_lost_checkpoints,
 )
 from flowlab.policies.run_folder import has_begun, lines_behind, read_resume, read_run_config
+from flowlab.policies.tensor_files import check_finite
 from flowlab.storage.validation import Finding, finding_of
-from flowlab.training.metrics import METRICS
 from flowlab.untrusted import is_there, read_json
-from flowlab.viz.training_metrics import metrics_lines
+from flowlab.viz.training_metrics import METRICS, metrics_lines
 
 
 def has_checksums(run: Path) -> bool:
@@ -60,8 +58,11 @@ def _check_begun(path: Path) -> None:
 
 
 def _check_plan(path: Path) -> None:
-    """The plan, and the dataset that it is about."""
-    planned, trained = read_run_config(path), read_trained(path)
+    """The plan, and the dataset that it is about; both stay behind where a policy is pushed to the Hub."""
+    trained = read_trained(path)
+    if trained.hub and not (path / RUN).exists():
+        return
+    planned = read_run_config(path)
     for place in planned.datasets:
         if not is_there(place):
             raise DataError(f"{path / RUN}: dataset: {place} is not there; restore it, or change where it is")
@@ -76,7 +77,7 @@ def _check_checkpoint(weights: Path) -> None:
     loaded = load_policy(weights)
     if weights.name != f"step-{loaded.step:08d}.safetensors":
         raise DataError(f"{weights}: holds the weights after {loaded.step} steps; call it after them")
-    _check_finite(weights, loaded.policy.state_dict())
+    check_finite(weights, loaded.policy.state_dict())
 
 
 def _check_resume(path: Path) -> None:
@@ -86,15 +87,9 @@ def _check_resume(path: Path) -> None:
     for name in ("policy", "average"):
         build_policy(read_trained(path).policy, groups.get(name, {}), f"{path / RESUME}: does not fit {path / POLICY}")
     for tensors in groups.values():
-        _check_finite(path / RESUME, tensors)
+        check_finite(path / RESUME, tensors)
     if step > read_run_config(path).steps:
         raise DataError(f"{path / RESUME}: is of step {step}, beyond the last; restore it")
-
-
-def _check_finite(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
-    for name, values in tensors.items():
-        if values.is_floating_point() and not values.isfinite().all():
-            raise DataError(f"{path}: '{name}' has values that are not finite; delete it, or restore it")
 
 
 def _check_metrics(path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy
 import safetensors
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from flowlab.checksums import json_checksum, without_checksum
-from flowlab.config import Settings, explain
+from flowlab.config import Settings, explain, later
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, FlowlabError, UsageError
@@ -39,8 +39,9 @@ _CHECKPOINT_NAME = re.compile(r"step-\d{8}\.safetensors")
 _LOG = logging.getLogger(__name__)
 _ADVICE = "delete it to use the checkpoint before it"
 _RESTORE = "restore it from a copy, or train anew into another --out"
-FREE = ("dataset", "more_datasets")
-"""What people may change in ``run.json``: where the datasets are, whose content is checked."""
+FREE = ("dataset", "more_datasets", "license", "hub")
+"""What is said of a run, and changes nothing of it: where the datasets are, whose content is checked, which people may
+change in ``run.json``; under which license the policy is, and where it was pulled from."""
 Model = TypeVar("Model", bound=Settings)
 
 
@@ -59,6 +60,10 @@ class TrainedPolicy(Settings):
     """Settings of the simulated scene; None where the dataset was recorded."""
     versions: Mapping[str, str]
     """Of what it was trained with."""
+    license: Annotated[str, later("")] = ""
+    """Under which others may use it, as the Hugging Face Hub names licenses; empty where nobody has said."""
+    hub: Annotated[str, later("")] = ""
+    """Where on the Hub it was pulled from, with the commit: ``user/name@commit``; empty where it was not."""
 
     @classmethod
     def now(cls, policy: PolicySpec, source: TrainingSource, buffer: ReplayBuffer) -> "TrainedPolicy":
@@ -104,13 +109,14 @@ def load_policy(path: Path, device: str = "cpu") -> LoadedPolicy:
     folder = weights.absolute().parents[1]
     trained = read_trained(folder)
     tensors, step = read_run_tensors(weights, folder, _ADVICE)
-    if _CHECKPOINT_NAME.fullmatch(weights.name) and weights.name != _checkpoint_name(step):
+    if _CHECKPOINT_NAME.fullmatch(weights.name) and weights.name != checkpoint_name(step):
         raise DataError(f"{weights}: holds the weights after {step} steps; restore it, or call it after them")
     policy = build_policy(trained.policy, tensors, f"{weights}: does not fit {folder / POLICY}")
     return LoadedPolicy(policy.requires_grad_(False).eval().to(device), trained, step, weights)
 
 
-def _checkpoint_name(step: int) -> str:
+def checkpoint_name(step: int) -> str:
+    """What the weights after so many steps are called."""
     return f"step-{step:08d}.safetensors"
 
 
@@ -210,7 +216,7 @@ def check_observer(trained: TrainedPolicy, where: Path, source: TrainingSource) 
 
 def save_weights(folder: Path, policy: PolicyNetwork, step: int) -> Path:
     """Keep the weights of a policy as a checkpoint of a run."""
-    path = folder / CHECKPOINTS / _checkpoint_name(step)
+    path = folder / CHECKPOINTS / checkpoint_name(step)
     with writing_run(folder):
         check_inside(folder, path.parent)
         path.parent.mkdir(exist_ok=True)

@@ -53,6 +53,13 @@ def read_tensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[str, 
     return tensors, about
 
 
+def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse tensors of a file that are no numbers. Raises :class:`DataError`."""
+    for name, values in tensors.items():
+        if values.is_floating_point() and not values.isfinite().all():
+            raise DataError(f"{path}: '{name}' has values that are not finite; delete it, or restore it")
+
+
 def metadata_of(file: Any, where: str, advice: str) -> dict[str, Any]:
     """What is said in a file of tensors; of one from an earlier version, its step. A :class:`KeyError` where flowlab
     did not say it: a name that changed on disk must not pass for one that is left out."""

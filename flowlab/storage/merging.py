@@ -17,6 +17,8 @@ from flowlab.storage.transfer import check_out, choose, write_datasets
 from flowlab.text import cut
 
 _LOG = logging.getLogger(__name__)
+_MAY_DIFFER = ("license", "hub")
+"""What datasets may say differently of themselves; it stands in the settings of the merged one."""
 _MOST = 2**62
 """Numbers are stored in 64 bits."""
 
@@ -52,10 +54,22 @@ def merge(datasets: Iterable[Dataset | Path | str], out: Path | str) -> Dataset:
         check_row_formats(source.path, source.receipts)
         if source.reservation:
             _LOG.warning("flowlab: %s", source.reservation)
-    check_alike(sources, "merged with", tuple(Provenance.model_fields))
+    check_alike(sources, "merged with", tuple(name for name in Provenance.model_fields if name not in _MAY_DIFFER))
     parts, about = _joined(sources)
     manifest = manifest_of(sources[0].manifest, parts, "merge", {"of": about})
+    manifest = manifest.model_copy(
+        update={"provenance": manifest.provenance.model_copy(update={"hub": "", "license": _license(sources)})}
+    )
     return write_datasets({place: (manifest, parts)})[0]
+
+
+def _license(sources: Sequence[Dataset]) -> str:
+    """The license of all; of several it is nobody's to say but the user's."""
+    found = {s.provenance.license: s.path for s in sources}
+    if len(found) > 1:
+        told = ", ".join(f"{path}: {name or 'not stated'}" for name, path in found.items())
+        _LOG.warning("flowlab: licenses differ (%s); the merged dataset has none stated", told)
+    return "" if len(found) > 1 else next(iter(found))
 
 
 class _Taken:
@@ -145,6 +159,7 @@ def _joined(sources: Sequence[Dataset]) -> tuple[list[Part], list[dict[str, Any]
             )  # fmt: skip
         told = {"dataset": str(source.path), "fingerprint": source.fingerprint, "episodes": episodes}
         told |= {"added_to_numbers": shift} if shift else {}
+        told |= {name: value for name in _MAY_DIFFER if (value := getattr(source.provenance, name))}
         if source.manifest.settings_digest != sources[0].manifest.settings_digest:
             told["settings"] = source.manifest.model_dump(mode="json")["settings"]
             _LOG.warning(

@@ -42,7 +42,15 @@ def validate(path: Path) -> Iterator[Finding]:
     except DataError as error:
         yield finding_of(path, error)
         return
+    yield from _check_complete(dataset)
     yield from _check_books(dataset)
+    yield from validate_content(dataset)
+
+
+def validate_content(dataset: Dataset) -> Iterator[Finding]:
+    """Every finding about the episodes of a dataset, and what it says of their numbers; none if they are sound."""
+    path = dataset.path
+    yield from (Finding(str(path), problem) for problem in row_problems(dataset))
     seen: dict[tuple[str, int], str] = {}
     for receipt in dataset.receipts:
         place = str(path / receipt.shard)
@@ -91,15 +99,19 @@ def _under(shard: str, problem: ArrayProblem, who: str = "") -> Finding:
     return Finding(f"{shard}/{problem.array}", who + problem.what)
 
 
-def _check_books(dataset: Dataset) -> Iterator[Finding]:
-    """Manifest, receipts and folder against each other."""
+def _check_complete(dataset: Dataset) -> Iterator[Finding]:
+    """What is still to be made."""
     path = dataset.path
     what = "recordings" if dataset.manifest.recordings else "episodes"
     for task, missing in dataset.missing.items():
         asked = dataset.manifest.requested[task]
         problem = f"{task}: {asked - missing} of {asked} {what}; run the same extract command again for the rest"
         yield Finding(str(path / MANIFEST), problem)
-    yield from (Finding(str(path), problem) for problem in row_problems(dataset))
+
+
+def _check_books(dataset: Dataset) -> Iterator[Finding]:
+    """Receipts and folder against each other."""
+    path = dataset.path
     kept = {r.rejects_shard for r in dataset.receipts if any(x.position is not None for x in r.rejects)}
     counted = kept | {r.shard for r in dataset.receipts if r.accepted}
     for shard in sorted([*(path / "shards").glob("*.zarr*"), *(path / "rejects").glob("*.zarr*")]):

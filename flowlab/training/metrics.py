@@ -9,9 +9,7 @@ from flowlab.files import write_atomically
 from flowlab.json_lines import append_line, line_of
 from flowlab.policies.checkpoint import resume_advice
 from flowlab.training.loggers import MetricsLogger
-from flowlab.viz.training_metrics import metrics_lines
-
-METRICS = "metrics.jsonl"
+from flowlab.viz.training_metrics import METRICS, metrics_lines
 
 
 class MetricsFile:

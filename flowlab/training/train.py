@@ -9,15 +9,17 @@ from typing import Any
 
 from flowlab.arguments import check_count, check_minutes, check_names, check_optional_count, check_path, check_settings
 from flowlab.data.source import paths_of
+from flowlab.hub.pulling import local_sources
 from flowlab.policies.checkpoint import writing_run
 from flowlab.policies.profiles import load_settings
 from flowlab.storage.dataset import Dataset
 from flowlab.training.loggers import check_loggers
-from flowlab.training.metrics import METRICS, last_metrics
+from flowlab.training.metrics import last_metrics
 from flowlab.training.precision import Precision
 from flowlab.training.resume import resume_run
 from flowlab.training.run import ComputeSettings, begin_run, run
 from flowlab.training.trainer import Trainer, TrainingProgress
+from flowlab.viz.training_metrics import METRICS
 
 CURVE = "curve.png"
 _SETTINGS_FORM = "a list of strings, as in settings=['batch.windows=64']"
@@ -106,7 +108,8 @@ def train(
 
     Args:
         data: A dataset, opened or its path, or a store in DP3's layout; or several datasets that say the same of their
-            frame, their camera, and what their numbers mean.
+            frame, their camera, and what their numbers mean. ``hub:user/name`` is a dataset on the Hugging Face Hub,
+            which is pulled into the cache.
         out: Folder of the run. Where the same call began it earlier, it goes on as if it had never stopped.
         policy: ``fdp``, ``dp3``, ``mba``, what an installed package offers, or ``module:Class``, whose module may lie
             in the current folder.
@@ -140,7 +143,8 @@ def train(
     check_loggers(tuple(logs), here)
     compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
     began = None if began_from is None else check_path(began_from, "began_from")
-    trainer = begin_run(paths_of(data), check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
+    sources = paths_of(local_sources(data, watch.on_start))
+    trainer = begin_run(sources, check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
     return _run(trainer, watch)
 
 

@@ -12,6 +12,7 @@ from flowlab.errors import DataError
 from flowlab.json_lines import read_lines
 from flowlab.text import shown
 
+METRICS = "metrics.jsonl"
 _EXPECTED, _ADVICE = "a JSON object of numbers with kind and step", "delete the line"
 Series = tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]
 """Steps, and the value at each."""

@@ -1,0 +1,1 @@
+"""Datasets and policies on the Hugging Face Hub: pushed without what is private, pulled without trust."""
