@@ -26,7 +26,7 @@ than 1 cm in their episode; the 95th percentile of a step is {p95:.2g} mm.
 {quality}
 ## Arrays of a shard
 
-`shards/*.zarr.zip` are zarr v3 groups of whole episodes; `{ends}` gives the row after each episode's last.
+`shards/*.zarr` are zarr v3 groups of whole episodes; `{ends}` gives the row after each episode's last.
 
 {arrays}
 """
