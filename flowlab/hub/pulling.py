@@ -138,22 +138,34 @@ class _Fetch:
     folder: Path
 
     def into(self, out: Path) -> None:
-        """Fetch it, and make it a folder of the local kind."""
+        """Fetch it, and make it a folder of the local kind. Raises :class:`DataError` where it is not sound."""
         if self.kind == "policy":
             self._fetch(tuple(FETCHED["policy"]))
-            with new_folder(out) as new:
+            with new_folder(out) as new, self._told_by_its_place(new), self._told_by_its_place(self.folder):
                 finish_policy(self.folder, new, self.name)
             return
-        where = self.hub.url(self.name, self.kind)
         self._fetch(BOOKS)
-        counted_shards(self.folder, self.wanted, where)
+        with self._told_by_its_place(self.folder):
+            counted_shards(self.folder, self.wanted, self.hub.url(self.name, self.kind))
         self._fetch(SHARDS)
-        check_sound(self.folder, where)
-        with new_folder(out) as new:
+        with self._told_by_its_place(self.folder):
+            check_sound(self.folder, self.folder)
+        with new_folder(out) as new, self._told_by_its_place(new):
             for file in self.folder.iterdir():
                 if file.name != _HELD_BY_THE_LIBRARY:
                     file.rename(new / file.name)
             finish_dataset(new, self.name)
+
+    @contextmanager
+    def _told_by_its_place(self, folder: Path) -> Iterator[None]:
+        """Tell what is wrong in a folder, which will be deleted, by where it is on the Hub, and who can help."""
+        try:
+            yield
+        except DataError as error:
+            if str(folder) not in str(error):
+                raise
+            what = str(error).replace(str(folder), self.hub.url(self.name, self.kind)).partition("; ")[0]
+            raise DataError(f"{what}; ask its owner to push it again, nothing is kept here") from error
 
     def _fetch(self, patterns: Sequence[str]) -> None:
         """Fetch some of the files, and nothing else: regular ones, as large as was said.

@@ -116,6 +116,7 @@ def test_a_hostile_dataset_is_one_sentence_and_leaves_nothing(
     code, out, err = call_cli(capsys, "hub", "pull", "eve/it", "--out", tmp_path / "in" / "it")
     assert code == 3, (out, err)
     assert sentence in err
+    assert not any(made in err for made in (".pull-", ".tmp-")), "it names a folder that is gone"
     assert "\x1b" not in err
     assert [line for line in err.splitlines() if not line.startswith(("flowlab: ", "pulling "))] == []
     assert not (tmp_path / "in").exists() or [*(tmp_path / "in").iterdir()] == [], "something was left"
@@ -216,6 +217,7 @@ def test_a_hostile_policy_is_one_sentence_and_leaves_nothing(
     code, out, err = call_cli(capsys, "hub", "pull", "eve/it", "--out", tmp_path / "in" / "it")
     assert code == 3, (out, err)
     assert sentence in err
+    assert not any(made in err for made in (".pull-", ".tmp-")), "it names a folder that is gone"
     assert [line for line in err.splitlines() if not line.startswith(("flowlab: ", "pulling "))] == []
     assert not (tmp_path / "in").exists() or [*(tmp_path / "in").iterdir()] == [], "something was left"
     assert not Path("/tmp/flowlab-was-here").exists()

@@ -185,8 +185,24 @@ REFUSED: dict[str, tuple[Change, str]] = {
         column(EPISODES, f"videos/{COLOR}/from_timestamp", [float("nan")]),
         r"from_timestamp is nan, expected seconds",
     ),
+    "pictures of another episode, too": (
+        column(EPISODES, f"videos/{COLOR}/to_timestamp", [0.5]),
+        r"is from 0 to 0.5 s in its file, and 5 steps at 20 a second last 0.25 s",
+    ),
+    "half a success": (columns(EPISODES, success=[0.5]), r"success of meta/episodes is 0.5, expected true or false"),
+    "success in words": (columns(EPISODES, success=["false"]), r"success of meta/episodes is 'false', expected true"),
+    "a count in words": (info(total_episodes="1"), r"total_episodes is '1', expected a whole number"),
+    "a mark in words": (
+        of_feature(DEPTH, info={"is_depth_map": "false"}),
+        r"is_depth_map of '.*' is 'false', expected true or false",
+    ),
+    "axes in a list": (camera(axes=["opencv"]), r"axes is \['opencv'\], expected opencv"),
+    "a matrix beyond numbers": (camera(K=[[10**400, 0, 1], [0, 1, 1], [0, 0, 1]]), r"K is .*finite numbers"),
     "a start beyond the end": (
-        column(EPISODES, f"videos/{COLOR}/from_timestamp", [9.0]),
+        lambda p: edit_table(
+            p / EPISODES,
+            lambda c: c.update({f"videos/{COLOR}/from_timestamp": [9.0], f"videos/{COLOR}/to_timestamp": [9.25]}),
+        ),
         r"ends after 0.250 s, and the last picture of episode_000000 would be at 9.200 s",
     ),
     "rows of nobody": (without(TABLE, "episode_index"), r"has no column episode_index"),

@@ -190,6 +190,49 @@ def test_the_word_of_the_dataset_on_success_counts(tmp_path: Path) -> None:
     assert [bool(opened(p).success[-1]) for p in find_recordings([path])] == [False, True]
 
 
+def test_success_may_be_a_number(tmp_path: Path) -> None:
+    path = v3(tmp_path / "d", color="png")
+    edit_table(path / "meta/episodes/chunk-000/file-000.parquet", lambda c: c.update(success=[0.0, 1.0]))
+    assert [bool(opened(p).success[-1]) for p in find_recordings([path])] == [False, True]
+
+
+def test_a_video_that_nothing_uses_may_be_missing(tmp_path: Path) -> None:
+    """Even what would name its file."""
+    path = v3(tmp_path / "d", demos=1)
+    other = {"dtype": "video", "shape": [96, 128, 3], "names": None, "info": {}}
+    edit_json(path / "meta/info.json", lambda i: i["features"].update({"observation.images.wrist": other}))
+    (one,) = find_recordings([path])
+    assert opened(one).frame(0).rgb is not None
+
+
+def test_of_several_depths_the_one_called_like_the_color_is_taken(tmp_path: Path, capsys: Capture) -> None:
+    path, other = v3(tmp_path / "d", demos=1, color="png"), "observation.depth.front"
+    edit_json(path / "meta/info.json", lambda i: i["features"].update({other: i["features"][DEPTH]}))
+    edit_table(path / "data/chunk-000/file-000.parquet", lambda c: c.update({other: c[DEPTH]}))
+    assert f"{COLOR} with {DEPTH}" in dry_run(capsys, path).checks["layout"][1]
+    edit_json(path / "meta/info.json", lambda i: i["features"].update({"depth.front": i["features"].pop(DEPTH)}))
+    assert f"may all be the depth of {COLOR}" in dry_run(capsys, path).problem
+
+
+def test_depth_with_another_calibration_is_refused(tmp_path: Path, capsys: Capture) -> None:
+    path = v3(tmp_path / "d", demos=1, color="png")
+    edit_json(path / "meta/info.json", lambda i: i["features"][DEPTH]["info"].update(
+        camera={**i["features"][COLOR]["info"]["camera"], "K": [[500, 0, 64], [0, 500, 48], [0, 0, 1]]}))  # fmt: skip
+    assert "has another K than that of" in dry_run(capsys, path).problem
+
+
+def test_a_task_may_have_any_letters(tmp_path: Path) -> None:
+    """What Unicode calls a separator of lines is none to JSON."""
+    path = v21(tmp_path / "d", demos=1)
+    lines = '{"task_index": 0, "task": "pour\u2028slowly\u0085"}\n'
+    (path / "meta/tasks.jsonl").write_text(lines, encoding="utf-8")
+    edit = (path / "meta/episodes.jsonl").read_text(encoding="utf-8")
+    row = {**json.loads(edit.split("\n")[0]), "tasks": ["pour\u2028slowly"]}
+    (path / "meta/episodes.jsonl").write_text(json.dumps(row, ensure_ascii=False) + "\n", encoding="utf-8")
+    (one,) = find_recordings([path])
+    assert opened(one).frame(0).rgb is not None
+
+
 def test_rewards_are_left_out_without_a_question(tmp_path: Path, capsys: Capture) -> None:
     path = v3(tmp_path / "d", demos=1, color="png")
     reward = {"dtype": "float32", "shape": [1], "names": None}
@@ -217,7 +260,8 @@ def test_episodes_lie_in_several_files(tmp_path: Path) -> None:
     table.with_name("file-001.parquet").rename(other)
     write_video(film / f"{COLOR}/chunk-002/file-003.mp4", filmed(1).rgb)
     where = {"data/chunk_index": [7], "data/file_index": [1], f"videos/{COLOR}/chunk_index": [2],
-             f"videos/{COLOR}/file_index": [3], f"videos/{COLOR}/from_timestamp": [0.0]}  # fmt: skip
+             f"videos/{COLOR}/file_index": [3], f"videos/{COLOR}/from_timestamp": [0.0],
+             f"videos/{COLOR}/to_timestamp": [STEPS / 20]}  # fmt: skip
     edit_table(told.with_name("file-001.parquet"), lambda c: c.update(where))
     for k, one in enumerate(find_recordings([path])):
         recording = opened(one)

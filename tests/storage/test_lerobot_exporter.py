@@ -276,6 +276,17 @@ def test_what_a_dataset_lacks_is_not_made_up(tmp_path: Path, capsys: Capture, ca
     assert not (tmp_path / "x/videos").exists()
 
 
+@pytest.mark.parametrize(("hertz", "said"), [(12.5, "12 a second"), (20.0, ""), (20.1, "")])
+def test_a_rate_that_lerobot_cannot_have_is_told(
+    hertz: float, said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    one = make_episode(0)
+    dataset = make_dataset(tmp_path / "d", [[replace(one, time_s=np.arange(len(one.action)) / hertz)]])
+    assert LeRobotExporter().export(dataset, tmp_path / "x") == 1
+    assert said in caplog.text if said else "a second" not in caplog.text
+    assert ("timestamps are off by up to 4.2%" in (tmp_path / "x/README.md").read_text()) == bool(said)
+
+
 def test_a_camera_that_moves_is_written_step_by_step(tmp_path: Path) -> None:
     poses = np.tile(POSE, (STEPS, 1, 1))
     poses[:, 0, 3] += 0.02 * np.arange(STEPS)

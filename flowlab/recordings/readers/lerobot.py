@@ -169,10 +169,18 @@ def _told(one: LeRobotEpisode, numbers: dict[str, np.ndarray]) -> Iterator[tuple
     if one.tasks:
         yield "meta/tasks", Metadata(task=one.tasks[0])
     success = one.said.get("success")
-    if isinstance(success, bool | int):
-        yield "success of meta/episodes", Metadata(success=bool(success))
+    if success is not None:
+        yield "success of meta/episodes", Metadata(success=_truth(f"{one.where}: success of meta/episodes", success))
     elif SUCCESS in numbers:
-        yield SUCCESS, Metadata(success=bool(numbers[SUCCESS].any()))
+        place = f"{one.data}: {SUCCESS}"
+        yield SUCCESS, Metadata(success=any(_truth(place, x) for x in np.unique(numbers[SUCCESS]).tolist()))
+
+
+def _truth(where: str, value: Any) -> bool:
+    """A value as true or false. Raises :class:`DataError` where it is neither: a number between may mean anything."""
+    if not isinstance(value, bool | int | float) or value not in (0, 1):
+        raise DataError(f"{where} is {shown(value)}, expected true or false, or 1 or 0")
+    return bool(value)
 
 
 def _of_tasks(one: LeRobotEpisode) -> Iterator[Check]:

@@ -52,7 +52,7 @@ def choose_camera(one: LeRobotEpisode, named: str | None) -> LeRobotCamera:
                         "flowlab needs both; record it with a depth camera, or mark the feature with info: "
                         "{is_depth_map: true}")  # fmt: skip
     pairs, guessed = _pairs(colors, depths)
-    names = {_short(color): (color, depth) for color, depth in pairs}
+    names = _by_name(pairs, where)
     if not names:
         found, others = (some_of([f.name for f in features]) for features in (depths, colors))
         raise DataError(f"{where} whose depth ({found}) belongs to none of its color pictures by its name ({others}); "
@@ -68,6 +68,25 @@ def choose_camera(one: LeRobotEpisode, named: str | None) -> LeRobotCamera:
                         f"'camera: {still[0]}' in {one.info.folder / FILE_NAME} (or the calibration file)")  # fmt: skip
     color, depth = names[wanted or still[0]]
     return LeRobotCamera(color, depth, tuple(_told(one, names, color, depth, wanted, guessed)))
+
+
+def _by_name(
+    pairs: Sequence[tuple[LeRobotFeature, LeRobotFeature]], where: str
+) -> dict[str, tuple[LeRobotFeature, LeRobotFeature]]:
+    """Cameras by what they are called. Of several depths that fit a color it is the one that is called like that, with
+    ``_depth`` at the end; raises :class:`DataError` where there is none."""
+    names: dict[str, tuple[LeRobotFeature, LeRobotFeature]] = {}
+    for color in {color.name: color for color, _ in pairs}.values():
+        depths = [depth for c, depth in pairs if c is color]
+        exact = [depth for depth in depths if depth.name == f"{color.name}_depth"]
+        if len(depths) > 1 and not exact:
+            raise DataError(
+                f"{where} in which {some_of([d.name for d in depths])} may all be the depth of {color.name}; call the "
+                f"one that is {color.name}_depth"
+            )
+        short = _short(color) if _short(color) not in names else color.name
+        names[short] = (color, (exact or depths)[0])
+    return names
 
 
 def _told(one: LeRobotEpisode, names: Sequence[str] | Mapping[str, Any], color: LeRobotFeature, depth: LeRobotFeature,
@@ -107,8 +126,12 @@ def known_calibration(one: LeRobotEpisode, camera: LeRobotCamera) -> Iterator[tu
         DataError: It is no calibration.
     """
     columns = {key: one.said.get(f"{CALIBRATION}/{key}") for key in ("K", "T_world_cam")}
-    about = camera.color.info.get(CALIBRATION)
-    about = about if isinstance(about, dict) else {}
+    about = camera.color.info.get(CALIBRATION) or {}
+    if not isinstance(about, dict):
+        raise DataError(
+            f"{one.info.place}: info.{CALIBRATION} of {shown(camera.color.name)} is {shown(about)}, expected a mapping "
+            "with K and T_world_cam"
+        )
     for name, said in ((f"the columns {CALIBRATION}/* of meta/episodes", columns), ("meta/info.json", about)):
         where = f"{one.where}: {name}: {CALIBRATION}"
         known: dict[str, Any] = {}
@@ -135,7 +158,7 @@ def _intrinsics(where: str, K: Any, about: Mapping[str, Any]) -> Intrinsics:
 def _pose(where: str, T: Any, about: Mapping[str, Any]) -> list[list[float]]:
     """A pose of a camera with the axes of OpenCV."""
     axes = about.get("axes", "opencv")
-    if axes not in _AXES:
+    if not isinstance(axes, str) or axes not in _AXES:
         raise DataError(
             f"{where}.axes is {shown(axes)}, expected opencv (x right, y down, z forward) or opengl (x right, y up)"
         )
@@ -148,7 +171,7 @@ def _matrix(where: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     """A matrix, as rows or row by row."""
     try:
         found = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.empty(0)
     if found.size != shape[0] * shape[1] or not np.isfinite(found).all():
         raise DataError(f"{where} is {shown(values)}, expected {shape[0]} x {shape[1]} finite numbers")
@@ -156,6 +179,20 @@ def _matrix(where: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
 
 
 def is_registered(camera: LeRobotCamera) -> bool | None:
-    """Whether depth is seen from the color camera; None where that is not said."""
+    """Whether depth is seen from the color camera; None where that is not said.
+
+    Raises:
+        DataError: Depth has a calibration of its own, by which it is not.
+    """
     color, depth = (f.info.get(CALIBRATION) for f in (camera.color, camera.depth))
-    return True if isinstance(color, dict) and color == depth else None
+    if not isinstance(color, dict) or not isinstance(depth, dict):
+        return None
+    if other := [
+        key for key in ("K", "T_world_cam", "width", "height") if color.get(key) != depth.get(key, color.get(key))
+    ]:
+        raise DataError(
+            f"info.{CALIBRATION} of {shown(camera.depth.name)} has another {' and '.join(other)} than that of "
+            f"{shown(camera.color.name)}, and flowlab takes depth that is registered to color; register it, or correct "
+            "meta/info.json"
+        )
+    return color == depth or None

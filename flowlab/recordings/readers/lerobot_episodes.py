@@ -20,6 +20,8 @@ _TASKS = ("meta/tasks.parquet", "meta/tasks.jsonl")
 _EPISODES = ("meta/episodes", "meta/episodes.jsonl")
 _TEXT_OF_TASK = ("task", "__index_level_0__")
 _CALLED = "episode_"
+_CLOCK_ERROR = 0.01
+"""Share of its length by which a video may last longer or shorter than its steps: the rate may be rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +48,26 @@ class LeRobotEpisode:
     def video(self, feature: str) -> tuple[Path, float]:
         """The file with the pictures of a feature, and when they begin in it [s]."""
         path = self._file(self.info.video_path, f"videos/{feature}/", video_key=feature)
-        start = self.said.get(f"videos/{feature}/from_timestamp", 0.0 if not self.info.is_v3 else None)
-        if isinstance(start, bool) or not isinstance(start, int | float) or not 0 <= start < 1e8:
+        if not self.info.is_v3:
+            return path, 0.0
+        start, stop = self._second(feature, "from_timestamp"), self._second(feature, "to_timestamp")
+        if start is None:
+            raise DataError(f"{self.where}: videos/{shown(feature)[1:-1]}/from_timestamp is missing")
+        lasts, step = self.length / self.info.fps, 1 / self.info.fps
+        if stop is not None and abs(stop - start - lasts) > max(step, _CLOCK_ERROR * lasts):
             raise DataError(
-                f"{self.where}: videos/{shown(feature)[1:-1]}/from_timestamp is {shown(start)}, expected seconds"
+                f"{self.where}: videos/{shown(feature)[1:-1]} is from {start:g} to {stop:g} s in its file, and "
+                f"{self.length} steps at {self.info.fps:g} a second last {lasts:g} s; copy meta/episodes again"
             )
-        return path, float(start)
+        return path, start
+
+    def _second(self, feature: str, key: str) -> float | None:
+        value = self.said.get(f"videos/{feature}/{key}")
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e8:
+            raise DataError(f"{self.where}: videos/{shown(feature)[1:-1]}/{key} is {shown(value)}, expected seconds")
+        return float(value)
 
     def _file(self, template: str, of: str, **values: str) -> Path:
         if not self.info.is_v3:
@@ -150,7 +166,7 @@ def _parquet_rows(file: Path) -> Iterator[dict[str, Any]]:
 
 
 def _json_lines(file: Path) -> Iterator[dict[str, Any]]:
-    for number, line in enumerate(read_text(file).splitlines(), 1):
+    for number, line in enumerate(read_text(file).split("\n"), 1):
         if line.strip():
             row = parse_json(line, f"{file}, line {number}")
             if not isinstance(row, dict):

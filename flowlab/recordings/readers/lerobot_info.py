@@ -22,6 +22,9 @@ _PATHS = {
 }  # fmt: skip
 _CONVERT = "convert it with LeRobot's own script"
 
+_DEPTH_MARKS = ("is_depth_map", "video.is_depth_map")
+"""Keys of a feature's info that tell depth, the second of which is of earlier versions."""
+
 
 @dataclass(frozen=True, slots=True)
 class LeRobotFeature:
@@ -43,7 +46,7 @@ class LeRobotFeature:
     @property
     def is_depth(self) -> bool:
         """Whether its pictures are said to be depth; or have one channel, and depth in their name."""
-        said = [self.info[k] for k in ("is_depth_map", "video.is_depth_map") if k in self.info]
+        said = [self.info[k] for k in _DEPTH_MARKS if k in self.info]
         return bool(said[0]) if said else self.dtype == "image" and 1 in self.shape and "depth" in self.name.lower()
 
 
@@ -126,8 +129,10 @@ def read_info(folder: Path) -> LeRobotInfo:
         if not isinstance(path, str):
             raise DataError(f"{place}: {key} is {shown(path)}, expected a path as {_PATHS[major][0]}")
     total = said.get("total_episodes")
+    if total is not None and (isinstance(total, bool) or not isinstance(total, int)):
+        raise DataError(f"{place}: total_episodes is {shown(total)}, expected a whole number")
     known = {name: _feature(place, name, about) for name, about in features.items()}
-    return LeRobotInfo(folder, version, float(fps), known, total if isinstance(total, int) else None,
+    return LeRobotInfo(folder, version, float(fps), known, total,
                        _whole(place, said, "chunks_size", 1000), data, video)  # fmt: skip
 
 
@@ -156,9 +161,11 @@ def _feature(place: Path, name: str, about: Any) -> LeRobotFeature:
             f"{place}: the feature {shown(name)} has the shape {shown(shape)}, expected at most {most:,} numbers"
         )
     info = about.get("info") or about.get("video_info") or {}
-    return LeRobotFeature(
-        name, dtype, tuple(shape), _names(about.get("names"), shape), info if isinstance(info, dict) else {}
-    )
+    info = info if isinstance(info, dict) else {}
+    for key in _DEPTH_MARKS:
+        if not isinstance(info.get(key, False), bool):
+            raise DataError(f"{place}: {key} of {shown(name)} is {shown(info[key])}, expected true or false")
+    return LeRobotFeature(name, dtype, tuple(shape), _names(about.get("names"), shape), info)
 
 
 def _names(names: Any, shape: Any) -> tuple[str, ...]:

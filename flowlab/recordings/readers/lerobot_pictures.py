@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -130,13 +131,19 @@ def _check_film(one: LeRobotEpisode, path: Path, feature: LeRobotFeature, last_s
                         "colors are no distances")  # fmt: skip
 
 
+_MOST = 1e6
+"""No whole number of a depth code is as large."""
+
+
 def depth_code(one: LeRobotEpisode, feature: LeRobotFeature) -> DepthCode:
     """The code of a depth video, by what the feature says of it. Raises :class:`DataError` where that cannot be."""
     values: dict[str, Any] = {}
     for key, kind in (("depth_min", float), ("depth_max", float), ("shift", float), ("use_log", bool)):
         value = feature.info.get(f"video.{key}", feature.info.get(key))
         fits = (
-            isinstance(value, bool) if kind is bool else isinstance(value, int | float) and not isinstance(value, bool)
+            isinstance(value, bool)
+            if kind is bool
+            else isinstance(value, float) or (type(value) is int and abs(value) < _MOST)
         )
         if value is not None and not fits:
             raise DataError(
@@ -220,7 +227,8 @@ def _without(path: Path, error: DataError) -> str:
 
 
 def picture_files(one: LeRobotEpisode) -> Iterator[Path]:
-    """The videos of an episode, those that can be named."""
+    """The videos of an episode, those that can be named: one that is not used may lack what names it."""
     for feature in one.info.features.values():
         if feature.dtype == "video":
-            yield one.video(feature.name)[0]
+            with suppress(DataError):
+                yield one.video(feature.name)[0]

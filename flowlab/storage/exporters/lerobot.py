@@ -47,8 +47,10 @@ configs:
 numbers mean and where they come from is in `meta/flowlab.json`; what each feature holds is in its `info` in
 `meta/info.json`.
 
-Not written: {left_out}.
+{clock}Not written: {left_out}.
 """
+_CLOCK_ERROR = 0.01
+"""LeRobot's timestamps may be off by such a share of an episode before that is said."""
 
 
 class LeRobotExporter(Exporter):
@@ -81,6 +83,8 @@ class LeRobotExporter(Exporter):
             export = _Export(self, dataset, chosen, plan, folder)
             export.write()
             (folder / "README.md").write_text(_card(dataset.path.name, chosen, plan))
+        if plan.late_by > _CLOCK_ERROR:
+            _LOG.warning("flowlab: %s: %s", path, _clock(plan))
         if plan.left_out:
             _LOG.warning(
                 "flowlab: %s: not written, as LeRobot has no features for it: %s",
@@ -90,11 +94,25 @@ class LeRobotExporter(Exporter):
         return len(chosen)
 
 
+def _clock(plan: ExportPlan) -> str:
+    """What is said where steps are not as regular as LeRobot wants them."""
+    return (
+        f"steps are written as {plan.fps} a second, as LeRobot wants a whole number and regular ones; its timestamps "
+        f"are off by up to {plan.late_by:.1%} of an episode, and the true times are in observation.time"
+    )
+
+
 def _card(name: str, chosen: Sequence[EpisodeRef], plan: ExportPlan) -> str:
     left_out = "; ".join(f"`{array}` ({meaning})" for array, meaning in plan.left_out.items()) or "nothing"
     frames = sum(ref.frames for ref in chosen)
     return _CARD.format(
-        name=name, episodes=len(chosen), frames=frames, fps=plan.fps, version=__version__, left_out=left_out
+        name=name,
+        episodes=len(chosen),
+        frames=frames,
+        fps=plan.fps,
+        version=__version__,
+        left_out=left_out,
+        clock=f"\nThe {_clock(plan)}.\n" if plan.late_by > _CLOCK_ERROR else "",
     )
 
 

@@ -70,6 +70,9 @@ class ExportPlan:
     left_out: Mapping[str, str]
     """Arrays that the dataset has and that are not written, and what they mean."""
     fps: int
+    """Steps a second, as a whole number, which LeRobot wants."""
+    late_by: float
+    """How much later LeRobot's timestamps are than the steps truly were, at most, as a share of an episode."""
 
 
 def make_plan(dataset: Dataset, chosen: Sequence[EpisodeRef], *, flat: bool) -> ExportPlan:
@@ -104,7 +107,8 @@ def make_plan(dataset: Dataset, chosen: Sequence[EpisodeRef], *, flat: bool) -> 
     kept = {s.path for s in (*taken, *pictures)} | {*_OF_EPISODES}
     left_out = {s.path: s.meaning for s in SCHEMA if s.path in shapes and s.path not in kept}
     sizes = {s.name: next(iter(shapes[s.path]))[:2] for s in pictures}
-    return ExportPlan(tuple(features), sizes, left_out, _rate(shards.values(), chosen))  # type: ignore[arg-type]
+    fps, late_by = _rate(shards.values(), chosen)
+    return ExportPlan(tuple(features), sizes, left_out, fps, late_by)  # type: ignore[arg-type]
 
 
 def _feature(spec: ArraySpec, shape: tuple[int, ...], known: Provenance, flat: bool) -> TableFeature | None:
@@ -140,14 +144,16 @@ def _channel_names(channels: Sequence[Channels], width: int) -> tuple[str, ...]:
     return tuple(names) if all(names) and len(set(names)) == width else ()
 
 
-def _rate(shards: Any, chosen: Sequence[EpisodeRef]) -> int:
-    """Steps a second, as a whole number, which LeRobot wants: of the usual step."""
+def _rate(shards: Any, chosen: Sequence[EpisodeRef]) -> tuple[int, float]:
+    """Steps a second, as a whole number, by the usual step; and the greatest share by which an episode lasts longer or
+    shorter than its steps then would."""
     wanted = {(ref.shard, ref.position) for ref in chosen}
     steps = [np.diff(shard.array("data/time", rows))
              for name, shard in zip(dict.fromkeys(ref.shard for ref in chosen), shards, strict=True)
              for k, rows in enumerate(shard.rows()) if (name, k) in wanted]  # fmt: skip
     every = np.concatenate(steps)
-    return max(1, round(1 / float(np.median(every)))) if len(every) else 1
+    fps = max(1, round(1 / float(np.median(every)))) if len(every) else 1
+    return fps, max((abs(len(s) / fps / float(s.sum()) - 1) for s in steps if len(s)), default=0.0)
 
 
 def calibration(episode: Episode) -> dict[str, Any]:
