@@ -14,6 +14,7 @@ from flowlab.policies.checkpoint import (
     RUN,
     build_policy,
     checkpoint_files,
+    checkpoint_name,
     load_policy,
     read_trained,
     warn_of_lost_checkpoints,
@@ -75,7 +76,7 @@ def _check_plan(path: Path) -> None:
 def _check_checkpoint(weights: Path) -> None:
     """Digest, shapes and numbers of a checkpoint, and its name."""
     loaded = load_policy(weights)
-    if weights.name != f"step-{loaded.step:08d}.safetensors":
+    if weights.name != checkpoint_name(loaded.step):
         raise DataError(f"{weights}: holds the weights after {loaded.step} steps; call it after them")
     check_finite(weights, loaded.policy.state_dict())
 

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from glob import escape
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flowlab.errors import DataError, FlowlabError, MissingLibraryError, UsageError, first_line
 from flowlab.hub.names import HubName, Kind, repo_type
 from flowlab.hub.repo_layout import MOST_FILES
 from flowlab.text import shown
 from flowlab.version import __version__
-
-if TYPE_CHECKING:
-    pass
 
 _LOG_IN = "log in with 'hf auth login', or set HF_TOKEN to a token of https://huggingface.co/settings/tokens"
 _AGAIN = "the same command goes on where this one ended"

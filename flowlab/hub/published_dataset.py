@@ -76,10 +76,9 @@ def _stage_shards(
 ) -> list[tuple[str, dict[str, Any]]]:
     """Put the shards of a unit into a folder; for each its path, and what its receipt says otherwise then."""
     staged = []
-    kept = any(x.position is not None for x in receipt.rejects)
     for there, path, checksum in (
         (bool(receipt.accepted), receipt.shard, "shard_sha256"),
-        (kept, receipt.rejects_shard, "rejects_sha256"),
+        (receipt.keeps_rejects, receipt.rejects_shard, "rejects_sha256"),
     ):
         if not there:
             continue
@@ -133,16 +132,13 @@ def check_sound(folder: Path, named: Path | str) -> None:
         raise DataError(f"{findings[0]}{more}")
 
 
-def counted_shards(folder: Path, files: Iterable[str], where: str) -> set[str]:
-    """The shards that the receipts of a folder count.
+def check_counted(folder: Path, files: Iterable[str], where: str) -> None:
+    """Refuse a repository that lacks a shard which the receipts of a folder count, or has others.
 
     Raises:
-        DataError: The repository lacks one, or has others.
+        DataError: Says which.
     """
-    counted = set()
-    for receipt in Dataset(folder).receipts:
-        counted |= {receipt.shard} if receipt.accepted else set()
-        counted |= {receipt.rejects_shard} if any(x.position is not None for x in receipt.rejects) else set()
+    counted = {shard for receipt in Dataset(folder).receipts for shard in receipt.shards}
     listed = {file for file in files if not matches(file, BOOKS)}
     if counted != listed:
         lacking, odd = sorted(counted - listed), sorted(listed - counted)
@@ -150,7 +146,6 @@ def counted_shards(folder: Path, files: Iterable[str], where: str) -> set[str]:
         raise DataError(
             f"{where}: {what}; it may be on its way still: try again later, or ask its owner to push it again"
         )
-    return counted
 
 
 def finish_dataset(folder: Path, where: HubName) -> None:

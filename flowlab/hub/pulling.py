@@ -12,7 +12,7 @@ from flowlab.errors import DataError, UsageError
 from flowlab.files import check_inside, locked, new_folder, told_when_unwritable
 from flowlab.hub.connection import HubConnection, HubError, RepoState, not_found
 from flowlab.hub.names import PREFIX, HubName, Kind
-from flowlab.hub.published_dataset import check_sound, counted_shards, finish_dataset, pulled_from
+from flowlab.hub.published_dataset import check_counted, check_sound, finish_dataset, pulled_from
 from flowlab.hub.published_policy import finish_policy, policy_pulled_from
 from flowlab.hub.repo_layout import BOOKS, FETCHED, SHARDS, matches, wanted_files
 from flowlab.user_cache import user_cache
@@ -146,7 +146,7 @@ class _Fetch:
             return
         self._fetch(BOOKS)
         with self._told_by_its_place(self.folder):
-            counted_shards(self.folder, self.wanted, self.hub.url(self.name, self.kind))
+            check_counted(self.folder, self.wanted, self.hub.url(self.name, self.kind))
         self._fetch(SHARDS)
         with self._told_by_its_place(self.folder):
             check_sound(self.folder, self.folder)

@@ -154,6 +154,16 @@ class Receipt(Settings):
         """Path below the dataset of the shard that keeps rejected episodes, where there are any to keep."""
         return shard_path("rejects", self.unit, zipped=bool(self.rejects_sha256))
 
+    @property
+    def keeps_rejects(self) -> bool:
+        """Whether there is such a shard."""
+        return any(x.position is not None for x in self.rejects)
+
+    @property
+    def shards(self) -> tuple[str, ...]:
+        """Paths below the dataset of all shards that there are."""
+        return (self.shard,) * bool(self.accepted) + (self.rejects_shard,) * self.keeps_rejects
+
 
 def shard_path(place: str, unit: str, *, zipped: bool = True) -> str:
     """Path below a dataset of a unit's shard, in ``shards`` or ``rejects``."""

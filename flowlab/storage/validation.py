@@ -85,7 +85,7 @@ def check_unit(dataset: Dataset, receipt: Receipt, *, contents: bool = True) -> 
 def lost_shards(folder: Path, receipt: Receipt) -> list[Path]:
     """The shards that a receipt counts, and that are not there."""
     shards = [receipt.shard] if receipt.accepted else []
-    shards += [receipt.rejects_shard] if any(x.position is not None for x in receipt.rejects) else []
+    shards += [receipt.rejects_shard] if receipt.keeps_rejects else []
     return [folder / shard for shard in shards if not (folder / shard).exists()]
 
 
@@ -112,8 +112,7 @@ def _check_complete(dataset: Dataset) -> Iterator[Finding]:
 def _check_books(dataset: Dataset) -> Iterator[Finding]:
     """Receipts and folder against each other."""
     path = dataset.path
-    kept = {r.rejects_shard for r in dataset.receipts if any(x.position is not None for x in r.rejects)}
-    counted = kept | {r.shard for r in dataset.receipts if r.accepted}
+    counted = {shard for receipt in dataset.receipts for shard in receipt.shards}
     for shard in sorted([*(path / "shards").glob("*.zarr*"), *(path / "rejects").glob("*.zarr*")]):
         if str(shard.relative_to(path)) not in counted:
             yield Finding(str(shard), "has no receipt, so it does not count; run the same extract command again")

@@ -18,11 +18,18 @@ from flowlab.storage.exporters.base import Exporter, select_episodes
 from flowlab.storage.exporters.lerobot_features import ExportPlan, calibration, make_plan, said_of_episode
 from flowlab.storage.exporters.lerobot_pictures import picture_features
 from flowlab.storage.exporters.lerobot_stats import FeatureStats, flattened
-from flowlab.storage.exporters.lerobot_tables import TableWriter, as_column, write_table, write_tasks
+from flowlab.storage.exporters.lerobot_tables import (
+    FILES_TO_CHUNK,
+    TableWriter,
+    as_column,
+    place_of,
+    write_table,
+    write_tasks,
+)
 from flowlab.version import __version__
 
 _LOG = logging.getLogger(__name__)
-_DATA_MB, _VIDEO_MB, _FILES_TO_CHUNK = 100, 200, 1000
+_DATA_MB, _VIDEO_MB = 100, 200
 _OWN = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -83,7 +90,7 @@ class LeRobotExporter(Exporter):
             export = _Export(self, dataset, chosen, plan, folder)
             export.write()
             (folder / "README.md").write_text(_card(dataset.path.name, chosen, plan))
-        if plan.late_by > _CLOCK_ERROR:
+        if plan.clock_error > _CLOCK_ERROR:
             _LOG.warning("flowlab: %s: %s", path, _clock(plan))
         if plan.left_out:
             _LOG.warning(
@@ -98,7 +105,7 @@ def _clock(plan: ExportPlan) -> str:
     """What is said where steps are not as regular as LeRobot wants them."""
     return (
         f"steps are written as {plan.fps} a second, as LeRobot wants a whole number and regular ones; its timestamps "
-        f"are off by up to {plan.late_by:.1%} of an episode, and the true times are in observation.time"
+        f"are off by up to {plan.clock_error:.1%} of an episode, and the true times are in observation.time"
     )
 
 
@@ -112,7 +119,7 @@ def _card(name: str, chosen: Sequence[EpisodeRef], plan: ExportPlan) -> str:
         fps=plan.fps,
         version=__version__,
         left_out=left_out,
-        clock=f"\nThe {_clock(plan)}.\n" if plan.late_by > _CLOCK_ERROR else "",
+        clock=f"\nThe {_clock(plan)}.\n" if plan.clock_error > _CLOCK_ERROR else "",
     )
 
 
@@ -184,7 +191,7 @@ class _Export:
 
     def _info(self, frames: int) -> dict[str, Any]:
         """``meta/info.json``."""
-        shared = self._cameras[0] if all(c == self._cameras[0] for c in self._cameras) else {}
+        shared = self._shared_camera or {}
         own: dict[str, Any] = {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _OWN.items()}
         features = (
             {p.name: p.to_json(shared) for p in self._pictures}
@@ -197,7 +204,7 @@ class _Export:
             "total_episodes": len(self._chosen),
             "total_frames": frames,
             "total_tasks": len(self._tasks),
-            "chunks_size": _FILES_TO_CHUNK,
+            "chunks_size": FILES_TO_CHUNK,
             "data_files_size_in_mb": _DATA_MB,
             "video_files_size_in_mb": _VIDEO_MB,
             "fps": self._plan.fps,
@@ -207,6 +214,12 @@ class _Export:
             "features": features,
         }
 
+    @property
+    def _shared_camera(self) -> dict[str, Any] | None:
+        """The calibration of all episodes; None where they differ."""
+        first = self._cameras[0]
+        return first if all(camera == first for camera in self._cameras) else None
+
     def _origin(self) -> dict[str, Any]:
         """``meta/flowlab.json``: where the episodes come from, and what LeRobot has no place for."""
         return {
@@ -214,15 +227,13 @@ class _Export:
             "fingerprint": self._dataset.fingerprint,
             "units": dict(self._dataset.manifest.units),
             "provenance": json.loads(self._dataset.provenance.model_dump_json()),
-            "camera": self._cameras[0]
-            if all(c == self._cameras[0] for c in self._cameras)
-            else "by episode: meta/episodes",
+            "camera": self._shared_camera or "by episode: meta/episodes",
             "left_out": dict(self._plan.left_out),
         }
 
 
 def _place(file: int, of: str) -> dict[str, int]:
-    return {f"{of}chunk_index": file // _FILES_TO_CHUNK, f"{of}file_index": file % _FILES_TO_CHUNK}
+    return {f"{of}{key}": number for key, number in place_of(file).items()}
 
 
 def _write_json(path: Path, values: Any) -> None:

@@ -71,8 +71,8 @@ class ExportPlan:
     """Arrays that the dataset has and that are not written, and what they mean."""
     fps: int
     """Steps a second, as a whole number, which LeRobot wants."""
-    late_by: float
-    """How much later LeRobot's timestamps are than the steps truly were, at most, as a share of an episode."""
+    clock_error: float
+    """How far LeRobot's timestamps are off from when the steps truly were, at most, as a share of an episode."""
 
 
 def make_plan(dataset: Dataset, chosen: Sequence[EpisodeRef], *, flat: bool) -> ExportPlan:
@@ -107,8 +107,8 @@ def make_plan(dataset: Dataset, chosen: Sequence[EpisodeRef], *, flat: bool) -> 
     kept = {s.path for s in (*taken, *pictures)} | {*_OF_EPISODES}
     left_out = {s.path: s.meaning for s in SCHEMA if s.path in shapes and s.path not in kept}
     sizes = {s.name: next(iter(shapes[s.path]))[:2] for s in pictures}
-    fps, late_by = _rate(shards.values(), chosen)
-    return ExportPlan(tuple(features), sizes, left_out, fps, late_by)  # type: ignore[arg-type]
+    fps, clock_error = _rate(shards.values(), chosen)
+    return ExportPlan(tuple(features), sizes, left_out, fps, clock_error)  # type: ignore[arg-type]
 
 
 def _feature(spec: ArraySpec, shape: tuple[int, ...], known: Provenance, flat: bool) -> TableFeature | None:

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from flowlab.records import Episode
 from flowlab.storage.exporters.lerobot_features import ExportPlan
 from flowlab.storage.exporters.lerobot_stats import evenly
-from flowlab.storage.exporters.lerobot_tables import as_pictures
+from flowlab.storage.exporters.lerobot_tables import as_pictures, place_of
 from flowlab.storage.exporters.lerobot_videos import (
     DEPTH_CODE,
     VideoCodec,
@@ -50,7 +50,7 @@ class PictureFeature:
         pictures = self._pictures(episode)
         if self._video is not None:
             part = self._video.add(map(depth_codes, pictures) if self._kind == "video" else pictures)
-            return None, {"chunk_index": part.file // 1000, "file_index": part.file % 1000,
+            return None, {**place_of(part.file),
                           "from_timestamp": part.from_s, "to_timestamp": part.to_s}  # fmt: skip
         suffix = ".tiff" if self._kind == "m" else ".png"
         coded = [png(p) if self._kind == "rgb" else depth_image(p, self._kind) for p in pictures]

@@ -10,6 +10,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Shaped
 
+FILES_TO_CHUNK = 1000
+"""A folder has so many files at most."""
+
+
+def place_of(file: int) -> dict[str, int]:
+    """The chunk of a file, and its number in there, as LeRobot calls them."""
+    return {"chunk_index": file // FILES_TO_CHUNK, "file_index": file % FILES_TO_CHUNK}
+
+
+def numbered(folder: Path, file: int, suffix: str) -> Path:
+    """Where a file of a number lies below a folder."""
+    chunk, number = place_of(file).values()
+    return folder / f"chunk-{chunk:03d}" / f"file-{number:03d}{suffix}"
+
 
 def as_column(values: Shaped[np.ndarray, "T ..."]) -> Any:
     """A column of an array with a row for each step: plain numbers, or lists of some depth."""
@@ -62,7 +76,7 @@ class TableWriter:
         self.close()
         self._file += 1
         self._bytes = 0
-        path = self._folder / f"chunk-{self._file // 1000:03d}" / f"file-{self._file % 1000:03d}.parquet"
+        path = numbered(self._folder, self._file, ".parquet")
         path.parent.mkdir(parents=True, exist_ok=True)
         split = [leaf for f in schema if (leaf := _float_leaf(f.name, f.type))]
         self._writer = pq.ParquetWriter(

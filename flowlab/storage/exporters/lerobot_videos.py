@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Num, UInt8, UInt16
 
 from flowlab.errors import DataError, first_line
+from flowlab.storage.exporters.lerobot_tables import numbered
 
 DEPTH_CODE = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5, "use_log": True}
 """LeRobot's usual code of depth videos [m]."""
@@ -110,7 +111,7 @@ class VideoWriter:
         self.close()
         self._file += 1
         self._frames = self._bytes = 0
-        path = self._folder / f"chunk-{self._file // 1000:03d}" / f"file-{self._file % 1000:03d}.mp4"
+        path = numbered(self._folder, self._file, ".mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(path), "w", format="mp4")
         stream = self._stream = self._container.add_stream(self._codec.name, rate=self._fps)
