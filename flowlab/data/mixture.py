@@ -1,0 +1,100 @@
+"""Several datasets trained on together, each with a share of the windows that its weight decides."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from flowlab.arguments import check_numbers
+from flowlab.config import Settings
+from flowlab.data.replay_buffer import ReplayBuffer
+from flowlab.data.source import SourcePart
+from flowlab.data.training_settings import TrainSettings
+from flowlab.data.window_sampler import MixedSampler, WindowSampler, index_windows, shares
+from flowlab.errors import DataError, UsageError
+
+Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class MixedDataset(Settings):
+    """What a policy has seen of one of several datasets."""
+
+    fingerprint: str
+    """Of its content."""
+    weight: Weight
+    """Relative to those of the others; what part of all windows it means, :func:`mixture_shares` tells."""
+    demonstrations: int
+    """So many of it were trained on."""
+    held_out: int
+
+
+def check_weights(value: Any, datasets: int) -> tuple[float, ...]:
+    """Weights as they were given, one for each dataset; empty where there are none.
+
+    Raises:
+        UsageError: They are no numbers above 0, or not as many as there are datasets.
+    """
+    if value is None:
+        return ()
+    weights = check_numbers(value, "weights", "one number for each dataset, as in 0.7,0.3")
+    for k, weight in enumerate(weights):
+        if not 0 < weight < math.inf:
+            advice = "; leave out a dataset that is not to be trained on" if weight == 0 else ""
+            raise UsageError(f"weights: number {k + 1} is {weight:g}, expected a finite number above 0{advice}")
+    if datasets == 1:
+        raise UsageError("weights: there is one dataset, and weights are its share beside others; leave them out")
+    if len(weights) != datasets:
+        raise UsageError(
+            f"weights: there are {len(weights)} for {datasets} datasets; give one for each, in the order of the "
+            f"datasets, as in {','.join(f'{1 / datasets:.2g}' for _ in range(datasets))}"
+        )
+    return weights
+
+
+def describe_mixture(
+    parts: Sequence[SourcePart],
+    buffer: ReplayBuffer,
+    train: Sequence[int],
+    held_out: Sequence[int],
+    weights: Sequence[float],
+) -> tuple[MixedDataset, ...]:
+    """What is trained on of each dataset; empty where there are no weights.
+
+    Raises:
+        DataError: Of one that has a weight nothing is left to train on.
+    """
+    if not weights:
+        return ()
+    taught, held = ([buffer.episodes[k].origin for k in demos] for demos in (train, held_out))
+    for k, part in enumerate(parts):
+        if k not in taught:
+            raise DataError(
+                f"{part.path}: its weight is {weights[k]:g}, and none of its demonstrations is trained on "
+                f"({held.count(k)} are held out); leave it out, or hold out fewer (--set data.held_out=0)"
+            )
+    return tuple(
+        MixedDataset(
+            fingerprint=part.fingerprint, weight=weights[k], demonstrations=taught.count(k), held_out=held.count(k)
+        )
+        for k, part in enumerate(parts)
+    )
+
+
+def mixture_shares(mixture: Sequence[MixedDataset]) -> tuple[float, ...]:
+    """What part of all windows each dataset has; they add up to 1."""
+    return tuple(shares([one.weight for one in mixture]).tolist())
+
+
+def make_sampler(
+    buffer: ReplayBuffer, train: Sequence[int], weights: Sequence[float], settings: TrainSettings
+) -> WindowSampler | MixedSampler:
+    """What draws the windows of some demonstrations: all of them alike, or each dataset as its weight says."""
+    batch, seed = settings.batch, settings.run.seed
+    if not weights:
+        return WindowSampler(
+            index_windows(buffer, train, settings.n_action_steps), batch.windows, batch.segment, seed
+        )
+    of_each = [[k for k in train if buffer.episodes[k].origin == d] for d in range(len(weights))]
+    windows = [index_windows(buffer, mine, settings.n_action_steps) for mine in of_each]
+    return MixedSampler(windows, weights, batch.windows, batch.segment, seed)
