@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from flowlab.arguments import check_numbers
-from flowlab.config import Settings
+from flowlab.config import Settings, later
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import SourcePart
 from flowlab.data.training_settings import TrainSettings
@@ -27,6 +28,21 @@ class MixedDataset(Settings):
     demonstrations: int
     """So many of it were trained on."""
     held_out: int
+    hub: Annotated[str, later("")] = ""
+    """Where on the Hub it was pulled from, ``user/name@commit``; empty where it was not."""
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetShare:
+    """The same for people: with the name of the dataset, and its share of all windows."""
+
+    name: str
+    share: float
+    about: MixedDataset
+
+    def __str__(self) -> str:
+        held = f" ({self.about.held_out} held out)" if self.about.held_out else ""
+        return f"{self.name}: {self.share:.4g} of the windows, from {self.about.demonstrations} demonstrations{held}"
 
 
 def check_weights(value: Any, datasets: int) -> tuple[float, ...]:
@@ -75,15 +91,45 @@ def describe_mixture(
             )
     return tuple(
         MixedDataset(
-            fingerprint=part.fingerprint, weight=weights[k], demonstrations=taught.count(k), held_out=held.count(k)
+            fingerprint=part.fingerprint,
+            weight=weights[k],
+            demonstrations=taught.count(k),
+            held_out=held.count(k),
+            hub=part.hub,
         )
         for k, part in enumerate(parts)
     )
 
 
-def mixture_shares(mixture: Sequence[MixedDataset]) -> tuple[float, ...]:
-    """What part of all windows each dataset has; they add up to 1."""
-    return tuple(shares([one.weight for one in mixture]).tolist())
+def check_drawn(parts: Sequence[SourcePart], weights: Sequence[float], settings: TrainSettings, steps: int) -> None:
+    """Refuse weights of which one is so small that nothing is drawn for it. Raises :class:`UsageError`."""
+    runs = steps * (settings.batch.windows // settings.batch.segment)
+    for part, share in zip(parts, shares(weights).tolist(), strict=True) if weights else ():
+        if share * runs < 1:
+            raise UsageError(
+                f"weights: {part.path} has {share:.3g} of the windows, less than one of the {runs:,} runs of "
+                f"{settings.batch.segment} windows in {steps:,} steps; give it more, train longer, or leave it out"
+            )
+
+
+def dataset_shares(mixture: Sequence[MixedDataset], datasets: str) -> list[DatasetShare]:
+    """The shares that the weights of a mixture mean.
+
+    Args:
+        mixture: Of a policy.
+        datasets: The paths of its datasets, as the policy tells them: with commas between.
+
+    Returns:
+        One for each dataset; all shares add up to 1.
+    """
+    if not mixture:
+        return []
+    places = datasets.split(", ")
+    if len(places) != len(mixture):  # one has a comma in its name
+        places = [f"dataset {k + 1}" for k in range(len(mixture))]
+    names = [f"hub:{one.hub}" if one.hub else place for one, place in zip(mixture, places, strict=True)]
+    found = shares([one.weight for one in mixture]).tolist()
+    return [DatasetShare(*one) for one in zip(names, found, mixture, strict=True)]
 
 
 def make_sampler(
@@ -92,9 +138,7 @@ def make_sampler(
     """What draws the windows of some demonstrations: all of them alike, or each dataset as its weight says."""
     batch, seed = settings.batch, settings.run.seed
     if not weights:
-        return WindowSampler(
-            index_windows(buffer, train, settings.n_action_steps), batch.windows, batch.segment, seed
-        )
+        return WindowSampler(index_windows(buffer, train, settings.n_action_steps), batch.windows, batch.segment, seed)
     of_each = [[k for k in train if buffer.episodes[k].origin == d] for d in range(len(weights))]
     windows = [index_windows(buffer, mine, settings.n_action_steps) for mine in of_each]
     return MixedSampler(windows, weights, batch.windows, batch.segment, seed)

@@ -30,6 +30,8 @@ class SourcePart:
     """Its episodes have so many rows."""
     scenes: Mapping[tuple[str, int], str]
     """What the scenes of its episodes are known by in the other datasets, by task and seed, as far as that is known."""
+    hub: str
+    """Where on the Hub it was pulled from, ``user/name@commit``; empty where it was not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,8 @@ def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
     check_trained_together(datasets)
     content = hashlib.sha256(" ".join(s.fingerprint for s in sources).encode()).hexdigest()[:16]
     parts = tuple(
-        SourcePart(d.path, s.fingerprint, s.frames, known_scenes(d)) for d, s in zip(datasets, sources, strict=True)
+        SourcePart(d.path, s.fingerprint, s.frames, known_scenes(d), s.provenance.hub)
+        for d, s in zip(datasets, sources, strict=True)
     )
     _tell_of_shared_scenes(parts)
     return TrainingSource(

@@ -34,9 +34,7 @@ class WindowSampler:
     run's windows are left out.
     """
 
-    def __init__(
-        self, windows: WindowIndex, size: int, segment: int, seed: int, stream: int | None = None
-    ) -> None:
+    def __init__(self, windows: WindowIndex, size: int, segment: int, seed: int, stream: int | None = None) -> None:
         self._windows = windows
         self._segment = min(segment, len(windows.now))
         self._runs = size // segment

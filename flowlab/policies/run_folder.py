@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
 import torch
 from pydantic import model_validator
@@ -59,7 +59,7 @@ class RunConfig(Settings):
     """Of the datasets, in their order; empty where all windows are drawn alike."""
 
     @model_validator(mode="after")
-    def _one_for_each(self) -> Self:
+    def _one_for_each(self) -> "RunConfig":
         if self.weights and len(self.weights) != len(self.datasets):
             raise ValueError(f"weights: there are {len(self.weights)} for {len(self.datasets)} datasets")
         return self

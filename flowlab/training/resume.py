@@ -61,7 +61,9 @@ def resume_run(
     step, groups = read_resume(folder)
     buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
     if describe_mixture(source.parts, buffer, config.train, config.held_out, config.weights) != trained.mixture:
-        raise DataError(f"{folder}: its {RUN} and {POLICY} tell of other datasets or weights; restore both from one run")
+        raise DataError(
+            f"{folder}: its {RUN} and {POLICY} tell of other datasets or weights; restore both from one run"
+        )
     policy = build_policy(
         trained.policy, groups.get("policy", {}), f"{folder}: its resume file does not fit its {POLICY}"
     )

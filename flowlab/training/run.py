@@ -14,7 +14,7 @@ from pydantic import PositiveInt
 
 from flowlab.config import Settings
 from flowlab.data.channels import infer_channels
-from flowlab.data.mixture import check_weights, describe_mixture
+from flowlab.data.mixture import check_drawn, check_weights, describe_mixture
 from flowlab.data.normalizer import fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
@@ -119,6 +119,10 @@ def prepare_run(
     train, held_out = split_episodes(buffer.episodes, settings.data, buffer.inferred)
     if overfit is not None:
         train = held_out = list(range(min(overfit, len(buffer.episodes))))
+    if not train:
+        raise DataError(
+            f"{source.path}: nothing is left to train on beside what is held out; add --set data.held_out=0"
+        )
     mixture = describe_mixture(source.parts, buffer, train, held_out, weighed)
     policy = _new_policy(source, buffer, settings, began_from)
     planned = RunConfig(
@@ -139,6 +143,7 @@ def prepare_run(
     if settings.run.minutes is not None and settings.run.steps is None:
         steps = _fitting_steps(Trainer(out, planned, copy.deepcopy(policy), buffer, processes), settings.run.minutes)
         planned = planned.model_copy(update={"steps": processes.broadcast(steps)})
+    check_drawn(source.parts, weighed, settings, planned.steps)
     trainer = Trainer(out, planned, policy, buffer, processes)
     trainer.begin(TrainedPolicy.now(policy.spec, source, buffer, mixture))
     return trainer

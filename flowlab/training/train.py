@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.arguments import check_count, check_minutes, check_names, check_optional_count, check_path, check_settings
-from flowlab.data.mixture import check_weights, mixture_shares
+from flowlab.data.mixture import check_weights, dataset_shares
 from flowlab.data.source import paths_of
 from flowlab.hub.pulling import local_sources
-from flowlab.policies.checkpoint import writing_run
+from flowlab.policies.checkpoint import read_trained, writing_run
 from flowlab.policies.profiles import load_settings
 from flowlab.storage.dataset import Dataset
 from flowlab.training.loggers import check_loggers
@@ -97,7 +97,7 @@ def train(
     seed: int | None = None,
     overfit: int | None = None,
     began_from: Path | str | None = None,
-    weights: Sequence[float] | None = None,
+    weights: Sequence[float | int] | None = None,
     device: str = "auto",
     threads: int = 1,
     precision: Precision = "auto",
@@ -226,6 +226,8 @@ def _describe(trainer: Trainer) -> Iterator[str]:
         f"{taught} of {', '.join(spec.tasks)}; {len(planned.held_out)} held out; "
         f"{trainer.processes.description}"
     )
+    trained = read_trained(trainer.folder)
+    yield from map(str, dataset_shares(trained.mixture, trained.dataset))
     if set(planned.held_out) & set(planned.inferred):
         yield (
             "actions of what is held out were inferred, too: held-out errors are against these, not against what a "
