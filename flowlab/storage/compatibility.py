@@ -78,7 +78,7 @@ def _check_rates(datasets: Sequence[Dataset]) -> None:
         if not 1 / _RATES_DIFFER < period / expected < _RATES_DIFFER:
             raise DataError(
                 f"{other.path}: cannot be trained on together with {first.path}: time: a step takes {period:.4g} s in "
-                f"{other.path}, and {expected:.4g} s in {first.path}; make the quicker one again of every so many-th frame "
+                f"{other.path}, and {expected:.4g} s in {first.path}; make the quicker one again of fewer frames "
                 "(track-real --set recording.every=3), or train on one of them"
             )
 

@@ -148,7 +148,7 @@ def test_weights_that_are_none_are_refused_before_anything_is_written(
 
 @pytest.mark.parametrize("weights", [0.5, "1,1,1", {"a": 1}, ["1", "1", "1"], [True, 1, 1], [1 + 1j, 1, 1], object()])
 def test_python_refuses_what_are_no_numbers(weights: Any) -> None:
-    with pytest.raises(UsageError, match="weights: must be one number for each dataset, as in 0.7,0.3; found"):
+    with pytest.raises(UsageError, match=r"weights: must be one number for each dataset, as in 0\.7,0\.3; found"):
         check_weights(weights, 3)
 
 
