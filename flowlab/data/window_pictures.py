@@ -14,10 +14,11 @@ from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.pictures import StoredPictures, kinds_of_pictures
+from flowlab.storage.shard import PICTURES_PER_CHUNK_BYTES
 
 PICTURES = ("rgb", "depth")
 Where = Literal["stored", "decoded"]
-_QUICK_BYTES = 4 << 20
+_QUICK_BYTES = PICTURES_PER_CHUNK_BYTES
 """So much may be decoded for one picture, for it to be read from the shards."""
 _NAMES = {"rgb": "color pictures", "depth": "depth pictures"}
 _HOW = {

@@ -72,7 +72,9 @@ class MixedSampler:
     run repeats them in it.
     """
 
-    def __init__(self, windows: Sequence[WindowIndex], weights: Sequence[float], size: int, segment: int, seed: int):
+    def __init__(
+        self, windows: Sequence[WindowIndex], weights: Sequence[float], size: int, segment: int, seed: int
+    ) -> None:
         self._windows = windows
         self._share = shares(weights)
         self._samplers = [WindowSampler(w, size, segment, seed, k) for k, w in enumerate(windows)]
