@@ -85,9 +85,11 @@ def describe_mixture(
     taught, held = ([buffer.episodes[k].origin for k in demos] for demos in (train, held_out))
     for k, part in enumerate(parts):
         if k not in taught:
+            there = sum(e.origin == k for e in buffer.episodes)
             raise DataError(
-                f"{part.path}: its weight is {weights[k]:g}, and none of its demonstrations is trained on "
-                f"({held.count(k)} are held out); leave it out, or hold out fewer (--set data.held_out=0)"
+                f"{part.path}: its weight is {weights[k]:g}, and none of its {there} demonstrations is trained on "
+                f"({held.count(k)} held out); leave it out, or choose others by data.held_out, data.demonstrations or "
+                "--overfit"
             )
     return tuple(
         MixedDataset(

@@ -90,7 +90,6 @@ def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
         SourcePart(d.path, s.fingerprint, s.frames, known_scenes(d), s.provenance.hub)
         for d, s in zip(datasets, sources, strict=True)
     )
-    _tell_of_shared_scenes(parts)
     return TrainingSource(
         first.path,
         content,
@@ -102,7 +101,7 @@ def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
     )
 
 
-def _tell_of_shared_scenes(parts: Sequence[SourcePart]) -> None:
+def warn_of_shared_scenes(parts: Sequence[SourcePart]) -> None:
     """Warn of datasets that show one scene in different episodes: films of it, say, or labels of another tracker."""
     owners: dict[tuple[str, str], Path] = {}
     for part in parts:

@@ -28,6 +28,7 @@ from flowlab.training.run import ComputeSettings, prepare_run
 from flowlab.training.train import Watch
 
 Capture = pytest.CaptureFixture[str]
+HUB = "user/b@0123456789012345678901234567890123456789"
 MARK = 1000.0
 """Added to the state of what is in a dataset, as often as its number, so that every row tells where it is from."""
 
@@ -47,7 +48,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     folder = tmp_path_factory.mktemp("mixture")
     return (
         marked(folder / "a", 0, [20] * 6),
-        marked(folder / "b", 1, [30, 21, 25], first=2),
+        marked(folder / "b", 1, [30, 21, 25], first=2, provenance=make_provenance(hub=HUB)),
         marked(folder / "c", 2, [9], task="push"),
     )
 
@@ -77,11 +78,10 @@ def test_what_was_mixed_is_told_by_the_run_and_by_info(data: tuple[Path, ...], u
     assert [(x["demonstrations"], x["held_out"]) for x in told] == [(5, 1), (3, 0), (1, 0)]
     code, out, _ = call_cli(capsys, "info", unbroken)
     assert code == 0
-    assert f"{data[1]}: 0.3 of the windows, from 3 demonstrations; weight 3, content {told[1]['fingerprint']}" in out
+    assert f"hub:{HUB}: 0.3 of the windows, from 3 demonstrations; weight 3, content {told[1]['fingerprint']}" in out
     facts = json.loads(call_cli(capsys, "info", unbroken, "--json")[1])
-    assert [(x["dataset"], x["share"]) for x in facts["mixture"]] == [
-        (str(d), s) for d, s in zip(data, (0.5, 0.3, 0.2), strict=True)
-    ]
+    named = [str(data[0]), f"hub:{HUB}", str(data[2])]
+    assert [(x["dataset"], x["share"]) for x in facts["mixture"]] == list(zip(named, (0.5, 0.3, 0.2), strict=True))
     assert call_cli(capsys, "validate", unbroken)[1] == f"{unbroken}: sound\n"
 
 
@@ -112,6 +112,8 @@ def test_a_policy_of_a_mixture_is_published_with_its_weights_and_without_paths(
     (tmp_path / "staged").mkdir()
     stage_policy(unbroken, tmp_path / "staged", name, None)
     assert str(data[0].parent) not in "".join(p.read_text() for p in (tmp_path / "staged").glob("*.[jm][sd]*"))
+    page = (tmp_path / "staged" / "README.md").read_text().replace("\\", "")
+    assert f"on a (0.5 of the windows), hub:{HUB} (0.3 of the windows), c (0.2 of the windows)." in page
     shutil.copytree(tmp_path / "staged", tmp_path / "fetched")
     (tmp_path / "pulled").mkdir()
     finish_policy(tmp_path / "fetched", tmp_path / "pulled", name)
@@ -169,11 +171,11 @@ def test_a_weight_of_what_is_all_held_out_is_refused(tmp_path: Path, capsys: Cap
     command = ["train", *places, "--policy", "dp3", "--out", tmp_path / "run", *SMALL, "--weights", "1,1"]
     code, _, err = call_cli(capsys, *command)
     assert code == 3
-    assert f"{places[1]}: its weight is 1, and none of its demonstrations is trained on (1 are held out)" in err
+    assert f"{places[1]}: its weight is 1, and none of its 1 demonstrations is trained on (1 held out)" in err
     assert call_cli(capsys, *command, "--set", "data.held_out=0")[0] == 0
     command[command.index(tmp_path / "run")] = tmp_path / "overfit"
     code, _, err = call_cli(capsys, *command, "--overfit", "1")
-    assert (code, "its weight is 1, and none of its demonstrations" in err) == (3, True)
+    assert (code, "its weight is 1, and none of its 1 demonstrations" in err) == (3, True)
 
 
 def _sped_up(e: Episode) -> Episode:
