@@ -11,7 +11,7 @@ from flowlab.arguments import check_path
 from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
-from flowlab.storage.compatibility import check_trained_together, known_scenes
+from flowlab.storage.compatibility import check_alike, check_trained_together, known_scenes
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
@@ -55,14 +55,20 @@ class TrainingSource:
         return tuple(part.path for part in self.parts) or (self.path,)
 
 
-def open_training_source(path: Path, *more: Path) -> TrainingSource:
+def open_training_source(path: Path, *more: Path, known: bool = False) -> TrainingSource:
     """Open a dataset, or a store in DP3's layout; or several datasets, to be trained on together.
+
+    Args:
+        path: Where it is.
+        more: Where the other datasets are.
+        known: A run was trained on them, perhaps by an earlier flowlab, which did not ask for their rates, nor whether
+            they share episodes.
 
     Raises:
         DataError: A folder is neither, or holds no episodes, or the datasets do not fit each other.
     """
     if more:
-        return _joined([_dataset_at(p) for p in (path, *more)])
+        return _joined([_dataset_at(p) for p in (path, *more)], check_alike if known else check_trained_together)
     if DP3Store.looks_like(path):
         store = DP3Store(path)
         named = hashlib.sha256(f"{store.fingerprint} {store.task}".encode()).hexdigest()[:16]  # after the folder
@@ -81,10 +87,10 @@ def _dataset_at(path: Path) -> Dataset:
     return Dataset(path)
 
 
-def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
+def _joined(datasets: Sequence[Dataset], check: Callable[[Sequence[Dataset]], None]) -> TrainingSource:
     """Several datasets as one. Where episodes come from, and what their numbers mean, must be the same."""
     first, sources = datasets[0], [source_of(d) for d in datasets]
-    check_trained_together(datasets)
+    check(datasets)
     content = hashlib.sha256(" ".join(s.fingerprint for s in sources).encode()).hexdigest()[:16]
     parts = tuple(
         SourcePart(d.path, s.fingerprint, s.frames, known_scenes(d), s.provenance.hub)

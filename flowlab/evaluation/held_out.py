@@ -53,7 +53,7 @@ def _open_source(loaded: LoadedPolicy, run: Path, data: Path | None) -> Training
     for path in paths:
         if not is_there(path):
             raise DataError(f"{run}: its dataset is no longer at {path}; give where it is now with --data")
-    source = open_training_source(*paths)
+    source = open_training_source(*paths, known=True)
     if source.fingerprint != loaded.trained.fingerprint:
         raise DataError(
             f"{run}: was trained on content {loaded.trained.fingerprint} of {source.path}, now {source.fingerprint}; "

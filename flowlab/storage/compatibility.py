@@ -12,6 +12,7 @@ from flowlab.text import cut
 
 ALIKE = ("kind", "world_frame", "camera", "state", "action", "action_limits", "observer", "queries")
 """What datasets must say alike of themselves to be trained on together."""
+_TRAINING = "trained on together with"
 _SHOWN = 300
 """Letters of the first difference."""
 _TIMED = 8
@@ -20,7 +21,7 @@ _RATES_DIFFER = 1.05
 """Clocks of cameras differ by less; what is farther apart was recorded at another rate."""
 
 
-def check_alike(datasets: Sequence[Dataset], doing: str, said: Sequence[str] = ALIKE) -> None:
+def check_alike(datasets: Sequence[Dataset], doing: str = _TRAINING, said: Sequence[str] = ALIKE) -> None:
     """Refuse datasets of which one is given twice, or that differ in what must be alike.
 
     Args:
@@ -49,7 +50,7 @@ def check_trained_together(datasets: Sequence[Dataset]) -> None:
     Raises:
         DataError: They do not fit each other; says in what, with both values.
     """
-    check_alike(datasets, "trained on together with")
+    check_alike(datasets)
     _check_rates(datasets)
     for k, other in enumerate(datasets[1:], 1):
         mine = {ref.digest for ref in other.refs}
@@ -77,7 +78,7 @@ def _check_rates(datasets: Sequence[Dataset]) -> None:
         first, expected = timed[0]
         if not 1 / _RATES_DIFFER < period / expected < _RATES_DIFFER:
             raise DataError(
-                f"{other.path}: cannot be trained on together with {first.path}: time: a step takes {period:.4g} s in "
+                f"{other.path}: cannot be {_TRAINING} {first.path}: time: a step takes {period:.4g} s in "
                 f"{other.path}, and {expected:.4g} s in {first.path}; make the quicker one again of fewer frames "
                 "(track-real --set recording.every=3), or train on one of them"
             )

@@ -51,7 +51,7 @@ def resume_run(
             raise DataError(
                 f"{folder}: its dataset is no longer at {place}; restore it, or change '{name}' in {folder / RUN}"
             )
-    source = open_training_source(*config.datasets)
+    source = open_training_source(*config.datasets, known=True)
     check_observer(trained, folder, source)
     if source.fingerprint != trained.fingerprint:
         raise DataError(

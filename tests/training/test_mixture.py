@@ -13,6 +13,7 @@ from synthetic import call_cli, make_dataset, make_episode, make_provenance
 from trained_runs import SMALL, lines_of, make_run, options, policy_of, saved_by, small_settings, without_times
 
 import flowlab
+from flowlab.data import source
 from flowlab.data.mixture import check_weights
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
@@ -254,6 +255,18 @@ def test_what_is_given_twice_is_refused_under_another_name_too(
     _refused(capsys, a, tmp_path / "some", tmp_path, f"2 of its 2 episodes are in {a}, too")
     merged = flowlab.merge([a, tmp_path / "some"], tmp_path / "merged")
     assert len(merged) == 6
+
+
+def test_a_run_of_an_earlier_version_on_datasets_that_share_episodes_goes_on(
+    data: tuple[Path, ...], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(data[0], tmp_path / "copy")
+    with monkeypatch.context() as earlier:
+        earlier.setattr(source, "check_trained_together", source.check_alike)
+        run = make_run(data[0], tmp_path / "copy", "--policy", "dp3", "--out", tmp_path / "run", *SMALL)
+    for command in (["validate", run], ["train", run, "--resume"], ["eval", run, "--offline"]):
+        code, _, err = call_cli(capsys, *command)
+        assert code == 0, err
 
 
 def test_dp3_stores_are_trained_on_alone(data: tuple[Path, ...], tmp_path: Path, capsys: Capture) -> None:
