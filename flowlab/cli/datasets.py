@@ -20,7 +20,12 @@ if TYPE_CHECKING:
 @click.argument("dataset", type=PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def info(dataset: Path, as_json: bool) -> None:
-    """Say what a dataset holds and how it was made."""
+    """Say what a dataset holds and how it was made; of a training run, what its policy is and learned from."""
+    if (dataset / "policy.json").is_file():
+        from flowlab.cli.run_info import print_run
+
+        print_run(dataset, as_json)
+        return
     from flowlab.cli.label_actions import print_inferred
     from flowlab.cli.reports import facts_of_checks, print_checks, print_quality
     from flowlab.pipeline.kept_checks import total_checks
