@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.cli.console import echo, json_option, print_json, print_table, quiet_option, warn
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import PluginName
 from flowlab.errors import DataError, FlowlabError
+from flowlab.registry import EXPORTERS
+from flowlab.text import counted
 
 if TYPE_CHECKING:
     from flowlab.storage.validation import Finding
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("dataset", type=PATH)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 def info(dataset: Path, as_json: bool) -> None:
     """Say what a dataset holds and how it was made."""
     from flowlab.cli.label_actions import print_inferred
@@ -81,7 +84,8 @@ def _numbers(values: list[float]) -> str:
 
 @click.command()
 @click.argument("folder", type=PATH)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@quiet_option
+@json_option
 def validate(folder: Path, as_json: bool) -> None:
     """Check a dataset, a training run or an experiment: one line for each finding, exit code 3 if there is any.
 
@@ -97,7 +101,7 @@ def validate(folder: Path, as_json: bool) -> None:
         print_json([{"file": f.place, "problem": f.problem} for f in findings])
     _warn_of_doubts(folder)
     if findings:
-        raise DataError(f"{folder}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
+        raise DataError(f"{folder}: {counted(len(findings), 'finding')}")
     if not as_json:
         echo(f"{folder}: sound{_reservation(folder)}")
 
@@ -128,15 +132,16 @@ def _warn_of_doubts(folder: Path) -> None:
     with suppress(FlowlabError):
         dataset = Dataset(folder) if (folder / MANIFEST).is_file() else None
         if dataset is not None and (without := missing_actions(dataset)):
-            say(f"warning: {folder}: {without}")
+            warn(f"warning: {folder}: {without}")
         totals = None if dataset is None else total_checks(dataset)
     if totals is None:
         return
     for episode in totals.doubtful:
         for check in episode.doubtful:
-            say(f"warning: {episode.shard}: {episode}: {check.about} is {check.verdict}: {check.says}")
+            warn(f"warning: {episode.shard}: {episode}: {check.about} is {check.verdict}: {check.says}")
     if totals.not_checked:
-        say(f"warning: {folder}: {totals.not_checked} episodes were labeled without checks, by an earlier flowlab")
+        without = counted(totals.not_checked, "episode was", "episodes were")
+        warn(f"warning: {folder}: {without} labeled without checks, by an earlier flowlab")
 
 
 def _reservation(folder: Path) -> str:
@@ -150,11 +155,20 @@ def _reservation(folder: Path) -> str:
 
 @click.command()
 @click.argument("dataset", type=PATH)
-@click.option("--to", "exporter", required=True, metavar="NAME", help="Which tool: lerobot, dp3, or one of a plug-in.")
+@click.option(
+    "--to",
+    "exporter",
+    type=PluginName(EXPORTERS),
+    required=True,
+    metavar="NAME",
+    help="Which tool: lerobot, dp3, or one of a plug-in.",
+)
 @click.option("--out", type=PATH, required=True, help="Where to write.")
 @click.option("--task", help="Only this task's episodes.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change an option of the exporter.")
-def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...]) -> None:
+@quiet_option
+@json_option
+def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...], as_json: bool) -> None:
     """Write a dataset in another tool's layout.
 
     lerobot: a LeRobotDataset v3.0. dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads.
@@ -167,5 +181,8 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     data = Dataset(dataset)
     count = to.export(data, out, task)
     if data.reservation:
-        say(f"flowlab: {data.reservation}")
-    echo(f"{count} episodes written to {out} for {exporter}")
+        warn(f"flowlab: {data.reservation}")
+    if as_json:
+        print_json({"dataset": str(dataset), "exporter": exporter, "out": str(out), "episodes": count})
+        return
+    echo(f"{counted(count, 'episode')} written to {out} for {exporter}")

@@ -60,7 +60,9 @@ def send_pictures(recording: rr.RecordingStream, episode: Episode) -> None:
     if episode.rgb is not None:
         camera = _shown_camera(episode.camera)
         size = camera.width, camera.height
-        bgr = [cv2.resize(_upright(episode, episode.rgb[t])[..., ::-1], size, None, 0, 0, cv2.INTER_AREA) for t in steps]
+        bgr = [
+            cv2.resize(_upright(episode, episode.rgb[t])[..., ::-1], size, None, 0, 0, cv2.INTER_AREA) for t in steps
+        ]
         blobs = [_encoded(".jpg", picture, _JPEG) for picture in bgr]
         recording.send_columns(RGB, times, rr.EncodedImage.columns(blob=blobs, media_type=_types("jpeg", blobs)))
 

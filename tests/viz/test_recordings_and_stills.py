@@ -174,7 +174,9 @@ def test_pictures_and_scalars_are_kept(episode: Episode, tmp_path: Path) -> None
     depth_mm = np.stack(pictures(found, "/depth", "EncodedDepthImage"))
     np.testing.assert_allclose(depth_mm / 1000, episode.depth, atol=5.1e-4)
     shown = np.stack(pictures(found, "/world/camera/main/rgb", "EncodedImage"))[..., ::-1]
-    smooth = [cv2.GaussianBlur(np.asarray(x, np.float32), (0, 0), 4) for x in (*shown, *episode.rgb)]  # JPEG keeps those
+    smooth = [
+        cv2.GaussianBlur(np.asarray(x, np.float32), (0, 0), 4) for x in (*shown, *episode.rgb)
+    ]  # JPEG keeps those
     np.testing.assert_allclose(smooth[:T], smooth[T:], atol=12)
     for kind, values in (("state", episode.state), ("action", episode.action)):
         read = [np.ravel(found[f"/scalars/{kind}/{k}", "Scalars:scalars"]) for k in range(values.shape[1])]
@@ -197,7 +199,9 @@ def test_pictures_of_a_camera_that_hangs_upside_down_are_upright_and_fit_the_sce
     origin = found[camera, "Transform3D:translation"][0][0]
     seen = K @ R.T @ ([0.1, 0.2, 0.15] - np.array(origin))  # a point, as the viewer projects it
     uv, _ = hanging.camera.project(np.array([[0.1, 0.2, 0.15]]))
-    np.testing.assert_allclose(seen[:2] / seen[2], [39, 29] - uv[0], atol=1e-4)  # as in the picture turned by 180 degrees
+    np.testing.assert_allclose(
+        seen[:2] / seen[2], [39, 29] - uv[0], atol=1e-4
+    )  # as in the picture turned by 180 degrees
 
 
 def test_a_long_episode_with_large_pictures_is_a_small_recording(episode: Episode, tmp_path: Path) -> None:
