@@ -54,9 +54,10 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command that was asked for, which is never silent for long."""
+        from flowlab.cli.console import show
         from flowlab.cli.heartbeat import beating
 
-        with beating(ctx):
+        with beating(ctx, show):
             return super().invoke(ctx)
 
     def resolve_command(

@@ -39,6 +39,11 @@ def say(line: str) -> None:
 def warn(line: str) -> None:
     """For people: what is to be known of a result, on standard error, even where quiet was asked for."""
     PULSE.said(line)
+    show(line)
+
+
+def show(line: str) -> None:
+    """A line on standard error."""
     _console.print(one_line(line), soft_wrap=True)
 
 

@@ -2,12 +2,10 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import click
-
-from flowlab.text import one_line
 
 SILENT_S = 25.0
 """After so long without a word it is said that the command is at work."""
@@ -40,7 +38,7 @@ PULSE = Heartbeat()
 
 
 @contextmanager
-def beating(context: click.Context) -> Iterator[None]:
+def beating(context: click.Context, tell: Callable[[str], None]) -> Iterator[None]:
     """While it is open, long silences are broken, unless the command was asked to be quiet."""
     PULSE.__init__()  # type: ignore[misc]
     ended = threading.Event()
@@ -49,7 +47,7 @@ def beating(context: click.Context) -> Iterator[None]:
         while not ended.wait(min(1.0, SILENT_S / 5)):
             line = PULSE.due(time.monotonic(), f"flowlab {context.invoked_subcommand}")
             if line and not context.meta.get(_QUIET):
-                click.echo(one_line(line), err=True)
+                tell(line)
 
     thread = threading.Thread(target=watch, name="heartbeat", daemon=True)
     thread.start()

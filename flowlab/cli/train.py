@@ -113,6 +113,11 @@ def train(
             f"say what to train and where to save it, as in 'flowlab train {sources[0]} --policy fdp --out runs/fdp'; "
             "--resume goes on with a run"
         )
+    else:
+        from flowlab.training.request import check_request
+
+        timed = minutes is not None
+        check_request(sources, policy=policy, profile=profile or "fast", settings=overrides, timed=timed, logs=logs)
     from flowlab.training import train as training
     from flowlab.training.distributed import is_first_process
 

@@ -10,6 +10,7 @@ from flowlab.checksums import has_sha256
 from flowlab.errors import DataError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
+from flowlab.storage.card import CARD, says_the_same
 from flowlab.storage.checks import ArrayProblem, episode_problems
 from flowlab.storage.dataset import Dataset, summaries
 from flowlab.storage.manifest import MANIFEST
@@ -134,6 +135,8 @@ def _check_summaries(dataset: Dataset) -> Iterator[Finding]:
             found = read_text(place)
         except DataError as error:
             yield finding_of(place, error)
+            continue
+        if name == CARD and says_the_same(found, text, dataset.manifest, dataset.receipts, dataset.stats):
             continue
         if found != text:
             yield Finding(
