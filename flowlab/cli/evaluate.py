@@ -15,7 +15,7 @@ from flowlab.registry import ENGINES
 @click.command("eval")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=PATH)
 @click.option("--episodes", type=click.IntRange(min=1), default=20, show_default=True, help="Of each task and seed.")
-@numbers_option("--seeds", default=["0,1,2"], show_default="0,1,2", help="Evaluation seeds.")
+@numbers_option("--seeds", default=["0,1,2"], help="Evaluation seeds  [0,1,2].")
 @names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="[all that every policy was trained on]")
 @click.option("--execute", type=click.IntRange(min=1), help="Steps of a plan to execute: 1 or 8, say  [the policy's].")
 @click.option("--checkpoints", is_flag=True, help="Evaluate every checkpoint of the runs: a learning curve.")

@@ -34,8 +34,7 @@ _ABOUT_SUMMARY = (
     "names",
     known=installed(TRACKERS),
     default=["rigid-bodies"],
-    show_default="rigid-bodies",
-    help="What labels.",
+    help="What labels  [rigid-bodies].",
 )
 @names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="Simulate recordings of these tasks.")
 @names_option(
@@ -82,7 +81,7 @@ def grade(
     \b
       flowlab grade --tracker rigid-bodies --tasks hammer,door-open
       flowlab grade --scenes tabletop,hands --episodes 6 --seed 1000
-      flowlab grade rec/sample --tracker rigid-bodies --tracker lucas-kanade --out graded
+      flowlab grade rec/sample --tracker rigid-bodies,lucas-kanade --out graded
 
     A RECORDING is a folder with a ground_truth.npz, or holds such folders. With --tasks, MetaWorld's experts
     are recorded by a simulated depth camera, with --scenes, things that move on a table are filmed; the recordings

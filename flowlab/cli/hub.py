@@ -157,7 +157,8 @@ def _list(sizes: Mapping[str, int], before: str, *, every: bool) -> None:
             for name, size in files.items():
                 echo(f"{before}{name}  {_size(size)}")
         else:
-            echo(f"{before}{folder}/  {len(files):,} files, {_size(sum(files.values()))}; --dry-run lists them all")
+            size = _size(sum(files.values()))
+            echo(f"{before}{folder}/  {counted(len(files), 'file')}, {size}; --dry-run lists them all")
 
 
 def _size(size: int) -> str:

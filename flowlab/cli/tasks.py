@@ -9,7 +9,7 @@ from flowlab.sim.tasks import GROUPS, TASKS, select_tasks
 
 
 @click.command()
-@names_option("--group", "groups", known=group_names, default=["all"], show_default=True, help="Of this difficulty.")
+@names_option("--group", "groups", known=group_names, default=["all"], help="Of this difficulty  [all].")
 @json_option
 def tasks(groups: tuple[str, ...], as_json: bool) -> None:
     """List MetaWorld's tasks with their difficulty and scripted expert."""

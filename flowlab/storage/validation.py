@@ -19,6 +19,7 @@ from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION
 from flowlab.storage.shard import REPAIR, Shard, episode_digest
 from flowlab.storage.stats import differing_stats, summarize
 from flowlab.storage.trainable import row_problems
+from flowlab.text import counted
 from flowlab.untrusted import read_text
 from flowlab.version import __version__
 
@@ -149,7 +150,9 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard, contents: boo
     if shard.attributes.settings_digest != dataset.manifest.settings_digest:
         yield Finding(place, f"made with other settings than {MANIFEST} states; {REPAIR}")
     if len(shard) != len(receipt.accepted):
-        yield Finding(place, f"holds {len(shard)} episodes, its receipt says {len(receipt.accepted)}; {REPAIR}")
+        yield Finding(
+            place, f"holds {counted(len(shard), 'episode')}, its receipt says {len(receipt.accepted)}; {REPAIR}"
+        )
         return
     columns, problems = {}, False
     for spec in shard.specs():
