@@ -157,8 +157,8 @@ def _list(sizes: Mapping[str, int], before: str, *, every: bool) -> None:
             for name, size in files.items():
                 echo(f"{before}{name}  {_size(size)}")
         else:
-            size = _size(sum(files.values()))
-            echo(f"{before}{folder}/  {counted(len(files), 'file')}, {size}; --dry-run lists them all")
+            whole = _size(sum(files.values()))
+            echo(f"{before}{folder}/  {counted(len(files), 'file')}, {whole}; --dry-run lists them all")
 
 
 def _size(size: int) -> str:
