@@ -96,6 +96,13 @@ def check_counts(value: Any, name: str, least: int | None = 0) -> tuple[int, ...
     return tuple(check_count(v, name, least) for v in listed)
 
 
+def check_numbers(value: Any, name: str, form: str) -> tuple[float, ...]:
+    """Numbers, in a list. Raises :class:`UsageError`, with the ``form`` in words, for anything else."""
+    if (listed := _listed(value, Real)) is None or any(isinstance(v, bool) for v in listed):
+        raise _wrong(name, value, form)
+    return tuple(map(float, listed))
+
+
 def check_minutes(value: Any, name: str = "minutes") -> float | None:
     """A time above 0, or None. Raises :class:`UsageError` for anything else."""
     if value is None:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,20 +18,30 @@ from flowlab.text import counted
 if TYPE_CHECKING:
     from flowlab.storage.validation import Finding
 
+_LISTED = 20
+"""So many episodes are listed, unless all are asked for."""
+
 
 @click.command()
 @click.argument("dataset", type=PATH)
+@click.option("--all", "every", is_flag=True, help="List all episodes, not the first ones.")
 @json_option
-def info(dataset: Path, as_json: bool) -> None:
-    """Say what a dataset holds and how it was made."""
+def info(dataset: Path, every: bool, as_json: bool) -> None:
+    """Say what a dataset holds and how it was made; of a training run, what its policy is and learned from."""
+    if (dataset / "policy.json").is_file():
+        from flowlab.cli.run_info import print_run
+
+        print_run(dataset, as_json)
+        return
     from flowlab.cli.label_actions import print_inferred
     from flowlab.cli.reports import facts_of_checks, print_checks, print_quality
     from flowlab.pipeline.kept_checks import total_checks
     from flowlab.storage.dataset import open_dataset
-    from flowlab.storage.overview import dataset_overview
+    from flowlab.storage.overview import dataset_overview, list_episodes
 
     data = open_dataset(dataset)
     overview = dataset_overview(data)
+    episodes = [asdict(e) for e in list_episodes(data)]
     tasks, stages = [asdict(t) for t in overview.tasks], [asdict(s) for s in overview.stages]
     arrays = [
         {"array": a.path, "dimensions": ", ".join(a.dims), "shape": " x ".join(map(str, a.shape)), "type": a.dtype,
@@ -54,7 +64,7 @@ def info(dataset: Path, as_json: bool) -> None:
         manifest = data.manifest.model_dump(mode="json")
         recordings = {"recordings": manifest["recordings"]} if manifest["recordings"] else {}
         recordings |= {} if checks is None else {"checks": facts_of_checks(checks)}
-        more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats}
+        more = {"tasks": tasks, "listed": episodes, "arrays": arrays, "stages": stages, "stats": data.stats}
         print_json(
             {**about, **more, "settings": manifest["settings"], "provenance": data.provenance.model_dump(mode="json")}
             | recordings
@@ -63,6 +73,7 @@ def info(dataset: Path, as_json: bool) -> None:
     for name, value in about.items():
         echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
     print_table(["task", "episodes", "asked for", "frames", "rejected"], [list(t.values()) for t in tasks])
+    _print_episodes(episodes, every)
     columns = ["array", "dimensions", "shape of the first shard", "type", "unit"]
     print_table(columns, [list(a.values()) for a in arrays])
     limits = [
@@ -75,6 +86,17 @@ def info(dataset: Path, as_json: bool) -> None:
         print_inferred(data.provenance, data.provenance.inferred)
     if checks is not None:
         print_checks(checks)
+
+
+def _print_episodes(episodes: list[dict[str, Any]], every: bool) -> None:
+    """Episodes by the numbers that other commands take: all, or the first ones."""
+    listed = episodes if every else episodes[:_LISTED]
+    columns = [
+        name for name in ("episode", "task", "seed", "frames", "recording") if any(e[name] != "" for e in listed)
+    ]
+    print_table(columns, [[str(e[name]) for name in columns] for e in listed])
+    if len(listed) < len(episodes):
+        echo(f"... and {counted(len(episodes) - len(listed), 'episode')} more; --all lists them")
 
 
 def _numbers(values: list[float]) -> str:

@@ -45,6 +45,9 @@ class PluginOption(click.Option):
 
 @click.command()
 @click.argument("sources", type=PATH_OR_HUB, nargs=-1, required=True, metavar="SOURCE...")
+@click.option(
+    "--weights", metavar="W,W,...", help="Of several datasets, the share of windows that each has: 0.7,0.3 or 7,3."
+)
 @click.option("--policy", cls=PluginOption, registry=POLICIES, help="What to train.")
 @click.option("--out", type=PATH, help="Folder of the run.")
 @click.option("--profile", help="fast, paper, or a YAML file with the settings that differ  [fast].")
@@ -65,6 +68,7 @@ class PluginOption(click.Option):
 @json_option
 def train(
     sources: tuple[Path, ...],
+    weights: str | None,
     policy: str | None,
     out: Path | None,
     profile: str | None,
@@ -86,6 +90,7 @@ def train(
       flowlab train data/push --policy fdp --out runs/push-fdp
       flowlab train data/push --policy dp3 --profile paper --out runs/push-dp3
       flowlab train data/push data/films-labeled --policy dp3 --out runs/push-all
+      flowlab train data/push data/films-labeled --weights 0.7,0.3 --policy dp3 --out runs/push-all
       flowlab train hub:user/pour@1.0 --policy fdp --out runs/pour-fdp
       flowlab train runs/push-fdp --resume
       torchrun --nproc-per-node 4 -m flowlab train data/push --policy fdp --out runs/push-fdp
@@ -94,6 +99,9 @@ def train(
     must say the same of their frame, their camera, and what their numbers mean. hub:user/name is a dataset on the
     Hugging Face Hub, which is pulled into the cache first; 'flowlab hub pull' does it without training.
 
+    All windows of several datasets are drawn alike, so that the larger ones have more of them; with --weights each
+    dataset has its share, whatever its size. The numbers are in the order of the datasets, and need not add up to 1.
+
     --minutes is CPU time of one thread, so that what else the machine does changes nothing; on a GPU it is time by
     the clock. The learning rate falls to zero within it.
 
@@ -101,7 +109,7 @@ def train(
     """
     if resume:
         given = {"--policy": policy, "--out": out, "--profile": profile, "--minutes": minutes, "--set": overrides,
-                 "--seed": seed, "--overfit": overfit, "--from": began_from}  # fmt: skip
+                 "--seed": seed, "--overfit": overfit, "--from": began_from, "--weights": weights}  # fmt: skip
         if changed := [name for name, value in given.items() if value not in (None, ())]:
             raise UsageError(f"--resume goes on as the run began, so leave out {', '.join(changed)}")
         if len(sources) > 1:
@@ -136,12 +144,22 @@ def train(
             done = training.train(
                 sources, out, policy=policy, profile=profile or "fast", minutes=minutes, settings=overrides, seed=seed,
                 overfit=overfit, began_from=began_from, device=device or "auto", threads=threads or 1,
-                precision=precision or "auto", logs=logs, watch=watch,
+                precision=precision or "auto", logs=logs, watch=watch, weights=_numbers(weights),
             )  # fmt: skip
     if first:
         _print(done, as_json)
     if not done.finished:
         sys.exit(130)
+
+
+def _numbers(text: str | None) -> list[float] | None:
+    """Numbers with commas between them."""
+    if text is None:
+        return None
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise UsageError(f"--weights {text}: must be numbers with commas between them, as in 0.7,0.3") from error
 
 
 def _print(done: "TrainedRun", as_json: bool) -> None:

@@ -226,8 +226,7 @@ def test_failed_units_end_in_exit_code_4_and_nothing_else_is_lost(tmp_path: Path
     result = flowlab(*command, cwd=tmp_path)
     assert result.returncode == 4
     assert (
-        "1 unit failed, the first (drawer-open-000000-000001) with: RuntimeError: the tide is too high"
-        in result.stderr
+        "1 unit failed, the first (drawer-open-000000-000001) with: RuntimeError: the tide is too high" in result.stderr
     )
     assert "Traceback" not in result.stderr
     assert "RuntimeError: the tide is too high" in (tmp_path / "d/failures.log").read_text()

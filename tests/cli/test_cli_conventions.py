@@ -146,3 +146,18 @@ def test_bash_completes_commands_tasks_in_a_list_and_plug_ins(tmp_path: Path) ->
     assert complete("flowlab", "ext") == ["extract-sim"]
     assert complete("flowlab", "extract-sim", "push,ham") == ["push,hammer"]
     assert complete("flowlab", "train", "data", "--policy", "f") == ["fdp"]
+
+
+def test_info_lists_episodes_by_the_numbers_that_viz_takes(tmp_path: Path, capsys: Capsys) -> None:
+    units = [[make_episode(k, task=task) for k in (5, 3, 9)] for task in ("push", "hammer")]
+    data = make_dataset(tmp_path / "d", units).path
+    listed = json.loads(call_cli(capsys, "info", data, "--json")[1])["listed"]
+    assert [(e["episode"], e["task"], e["seed"]) for e in listed[:4]] == [
+        (0, "hammer", 3), (1, "hammer", 5), (2, "hammer", 9), (3, "push", 3),
+    ]  # fmt: skip
+    for e in listed[1:5:3]:
+        output = call_cli(capsys, "viz", data, "--episode", e["episode"], "--save", tmp_path / "e.rrd")[1]
+        assert output.startswith(f"{e['task']} seed {e['seed']}:")
+    many = make_dataset(tmp_path / "many", [[make_episode(k) for k in range(22)]]).path
+    assert "... and 2 episodes more; --all lists them" in call_cli(capsys, "info", many)[1]
+    assert "more; --all" not in call_cli(capsys, "info", many, "--all")[1]
