@@ -57,8 +57,8 @@ def check_trained_together(datasets: Sequence[Dataset]) -> None:
         for first in datasets[:k]:
             if shared := sum(ref.digest in mine for ref in first.refs):
                 raise DataError(
-                    f"{other.path}: {shared} of its {counted(len(other), 'episode')} are in {first.path}, too, and would count "
-                    f"twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
+                    f"{other.path}: {shared} of its {counted(len(other), 'episode')} are in {first.path}, too, and "
+                    f"would count twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
                 )
 
 

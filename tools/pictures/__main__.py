@@ -67,7 +67,7 @@ def draw_film(picture: Path, work: Path) -> None:
 
 
 def draw_grade(picture: Path, work: Path) -> None:
-    """How far off labels are on films of all families that nothing was fitted on. An hour on one core."""
+    """How far off labels are on films of all families that nothing was fitted on; what takes longest."""
     trackers = ("--tracker", "rigid-bodies,lucas-kanade")
     flowlab("grade", "--scenes", "all", "--episodes", 6, "--seed", 1000, *trackers, "--out", work / "grade")
     picture.write_bytes((work / "grade" / "grade.png").read_bytes())
