@@ -14,6 +14,7 @@ from flowlab.data.source import SourcePart
 from flowlab.data.training_settings import TrainSettings
 from flowlab.data.window_sampler import MixedSampler, WindowSampler, index_windows, shares
 from flowlab.errors import DataError, UsageError
+from flowlab.text import counted
 
 Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, lt=1 << 62)]
@@ -44,7 +45,8 @@ class DatasetShare:
 
     def __str__(self) -> str:
         held = f" ({self.about.held_out} held out)" if self.about.held_out else ""
-        return f"{self.name}: {self.share:.4g} of the windows, from {self.about.demonstrations} demonstrations{held}"
+        taught = counted(self.about.demonstrations, "demonstration")
+        return f"{self.name}: {self.share:.4g} of the windows, from {taught}{held}"
 
 
 def check_weights(value: Any, datasets: int) -> tuple[float, ...]:
@@ -89,7 +91,7 @@ def describe_mixture(
         if k not in taught:
             there = sum(e.origin == k for e in buffer.episodes)
             raise DataError(
-                f"{part.path}: its weight is {weights[k]:g}, and none of its {there} demonstrations is trained on "
+                f"{part.path}: its weight is {weights[k]:g}, and none of its demonstrations ({there}) is trained on "
                 f"({held.count(k)} held out); leave it out, or choose others by data.held_out, data.demonstrations or "
                 "--overfit"
             )

@@ -11,7 +11,7 @@ from flowlab.provenance import Provenance
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import differences
 from flowlab.storage.shard import Shard
-from flowlab.text import cut
+from flowlab.text import counted, cut
 
 ALIKE = ("kind", "world_frame", "camera", "state", "action", "action_limits", "observer", "queries")
 """What datasets must say alike of themselves to be trained on together."""
@@ -60,8 +60,8 @@ def check_trained_together(datasets: Sequence[Dataset]) -> None:
         for first in datasets[:k]:
             if shared := sum(ref.digest in mine for ref in first.refs):
                 raise DataError(
-                    f"{other.path}: {shared} of its {len(other)} episodes are in {first.path}, too, and would count "
-                    f"twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
+                    f"{other.path}: {shared} of its {counted(len(other), 'episode')} are in {first.path}, too, and "
+                    f"would count twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
                 )
 
 
