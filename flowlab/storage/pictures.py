@@ -125,7 +125,13 @@ class StoredPictures:
 
 
 def kinds_of_pictures(dataset: Dataset) -> tuple[str, ...]:
-    """Which kinds of pictures the first episodes of a dataset have. Raises :class:`DataError` where these are bad."""
+    """Which kinds of pictures the first episodes of a dataset have; none where its shards are gone.
+
+    Raises:
+        DataError: The first shard is bad.
+    """
     first = next(r for r in dataset.receipts if r.accepted)
+    if not (dataset.path / first.shard).exists():
+        return ()
     shard = unit_shard(dataset.path, first)
     return tuple(spec.name for spec in SCHEMA if spec.is_picture and shard.has(spec))
