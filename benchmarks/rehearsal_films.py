@@ -107,7 +107,7 @@ class Studio:
         return NoisyCamera(Sensor(PRESETS[self.settings.sensor], number))
 
     def demonstrate(self, number: int) -> Rollout | None:
-        """The expert's attempt, a row for every picture: 8-d state, and the 8-d action up to the next. None if it fails.
+        """The expert's attempt, a row for every picture: state, and the action up to the next. None if it fails.
 
         He acts at every control step, as an operator's hand moves between pictures; his gripper only opens or closes.
         """

@@ -75,12 +75,11 @@ class PoseArm:
     def steps(self, action: Float[np.ndarray, "8"]) -> Iterator[Float32[np.ndarray, "4"]]:
         """MetaWorld's actions that carry out one of eight numbers, each to be executed before the next is asked for.
 
-        The hand's target gets as far toward what is asked for as 1 cm along each axis in every step allows, and MetaWorld
-        keeps it in its own workspace.
+        The hand's target gets as far toward what is asked for as 1 cm along each axis in every step allows, and
+        MetaWorld keeps it in its own workspace.
 
         Args:
-            action: As the settings mean it. A gripper number from 0.5 on closes. The quaternion's length and sign do not
-                matter, as long as it is one of a rotation.
+            action: As the settings mean it. A gripper number from 0.5 on closes; the quaternion's sign does not matter.
 
         Raises:
             DataError: It is no action, or asks for a turn that MetaWorld's hand cannot take.
@@ -99,8 +98,8 @@ class PoseArm:
     def _check(self, action: Float[np.ndarray, "..."]) -> None:
         if action.shape != (POSE_SIZE,):
             raise DataError(
-                f"action has the shape {action.shape}, expected ({POSE_SIZE},): x, y, z [m], quaternion x, y, z, w, and "
-                "gripper, 1 closed and 0 open"
+                f"action has the shape {action.shape}, expected ({POSE_SIZE},): x, y, z [m], quaternion x, y, z, w, "
+                "and gripper, 1 closed and 0 open"
             )
         if not np.isfinite(action).all():
             k = int(np.argmin(np.isfinite(action)))
@@ -108,8 +107,8 @@ class PoseArm:
         norm = float(np.linalg.norm(action[3:7]))
         if abs(norm - 1) > _NORM_TOLERANCE:
             raise DataError(
-                f"action[3:7] is {action[3:7].round(3).tolist()}, of length {norm:.3g}, expected a quaternion x, y, z, w "
-                "of length 1"
+                f"action[3:7] is {action[3:7].round(3).tolist()}, of length {norm:.3g}, expected a quaternion x, y, z, "
+                "w of length 1"
             )
         held = Rotation.from_quat(_scipy_order(self.simulation.data.mocap_quat[0]))
         turn = np.rad2deg((Rotation.from_quat(action[3:7]) * held.inv()).magnitude())
