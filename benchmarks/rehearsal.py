@@ -34,6 +34,7 @@ from flowlab.config import explain, override
 from flowlab.errors import UsageError
 from flowlab.files import new_file, write_json
 from flowlab.storage.dataset import Dataset
+from flowlab.untrusted import read_json
 
 POLICIES = {"dp3": ("dp3", "estimated"), "fdp-exact": ("fdp", "exact"), "fdp-estimated": ("fdp", "estimated")}
 """Of the table: what is trained, and on which labels. DP3 sees none: its clouds are the same in both datasets."""
@@ -135,7 +136,7 @@ class Rehearsal:
             data = self.labels(task, kind).path
             about = ("--policy", policy, "--out", run, "--seed", self.seed, "--device", "cpu")
             _flowlab("train", data, *about, *_set([*TRAINING, f"run.steps={self.steps}"]))
-            return {}
+            return {"channels": read_json(run / "policy.json")["policy"]["channels"]}
 
         self.unit(f"train-{task}-{name}", make, training=TRAINING, steps=self.steps, seed=self.seed)
         return run
