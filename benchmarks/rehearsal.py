@@ -21,23 +21,27 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 from rehearsal_films import SETUPS, FilmSettings
 from rehearsal_labels import compare_labels
-from rehearsal_trials import drive
+from rehearsal_trials import try_expert, try_policy, try_repetition
 
 import flowlab
 from flowlab.config import explain, override
-from flowlab.errors import UsageError
+from flowlab.errors import FlowlabError, UsageError
 from flowlab.files import new_file, write_json
 from flowlab.storage.dataset import Dataset
 from flowlab.untrusted import read_json
 
 POLICIES = {"dp3": ("dp3", "estimated"), "fdp-exact": ("fdp", "exact"), "fdp-estimated": ("fdp", "estimated")}
 """Of the table: what is trained, and on which labels. DP3 sees none: its clouds are the same in both datasets."""
+BASELINES = {"expert": try_expert, "repetition": try_repetition}
+"""Beside them: who is told where everything is, and who never looks."""
 RECIPES = {"estimated": ["real"], "exact": [str(Path(__file__).with_name("rehearsal_exact.yaml"))]}
 LABELING = (
     "observer.crop={low: [-0.5, 0.25, 0.015], high: [0.5, 0.97, 0.8]}",  # the table's top is at 0, and depth errs
@@ -87,20 +91,18 @@ class Rehearsal:
         folder = self.out / "films" / task
 
         def make() -> dict[str, Any]:
-            studio, replayed, frames, number = self.film.stage(task, color=True), [], [], 0
-            while len(replayed) < self.demonstrations:
-                if number == MOST_ATTEMPTS * self.demonstrations:
-                    raise SystemExit(
-                        f"{task}: MetaWorld's expert solved {len(replayed)} of {number} layouts; use others"
-                    )
-                rollout = studio.demonstrate(number)
-                if rollout is not None:
-                    replayed.append(studio.replay(number, rollout.action))
+            studio, repeated, frames, number = self.film.stage(task, color=True), 0, list[int](), -1
+            for number in islice(studio.layouts(0), MOST_ATTEMPTS * self.demonstrations):
+                if len(frames) == self.demonstrations:
+                    return {"attempts": number, "repeated": repeated, "frames": sum(frames)}
+                if (rollout := studio.demonstrate(number)) is not None:
+                    repeated += any(studio.repeat(number, rollout.action).success)
                     frames.append(len(rollout))
                     if not (folder / f"{number:03d}").exists():
                         studio.film(folder / f"{number:03d}", rollout, number)
-                number += 1
-            return {"attempts": number, "replayed": sum(replayed), "frames": sum(frames)}
+            raise SystemExit(
+                f"{task}: MetaWorld's expert solved {len(frames)} layouts up to {number}; move objects less"
+            )
 
         return self.unit(f"films-{task}", make)
 
@@ -142,14 +144,14 @@ class Rehearsal:
         return run
 
     def tried(self, task: str, name: str) -> dict[str, Any]:
-        """How a policy of the table does."""
-
-        run = self.train(task, name)
-        return self.unit(
-            f"trials-{task}-{name}",
-            lambda: {"tried": drive(run, task, self.film, self.trials)},
-            task=task, policy=name, trials=self.trials, steps=self.steps, seed=self.seed,
-        )  # fmt: skip
+        """How a policy of the table does, or what stands beside them."""
+        about = {"task": task, "policy": name, "trials": self.trials}
+        if name in BASELINES:
+            make = partial(BASELINES[name], task, self.film, self.trials)
+        else:
+            make = partial(try_policy, self.train(task, name), task, self.film, self.trials)
+            about |= {"steps": self.steps, "seed": self.seed}
+        return self.unit(f"trials-{task}-{name}", lambda: {"tried": make()}, **about)
 
     def do(self, task: str) -> None:
         """All of a task."""
@@ -157,12 +159,12 @@ class Rehearsal:
         for kind in RECIPES:
             self.labels(task, kind)
         self.errors(task)
-        for name in POLICIES:
+        for name in (*BASELINES, *POLICIES):
             self.tried(task, name)
 
     def report(self) -> None:
         """The scored trials as a person would have written them down, and flowlab's report of them."""
-        units = _units(self.out, "trials")
+        units = _trials(self.out)
         with new_file(self.out / "trials.csv") as place, place.open("w", newline="") as file:
             lines = csv.writer(file)
             lines.writerow(("policy", "task", "trial", "success", "note"))
@@ -204,20 +206,19 @@ def _machine() -> dict[str, str]:
     return {"commit": commit, "machine": names[0] if names else platform.processor()}
 
 
-def _units(out: Path, step: str) -> list[dict[str, Any]]:
-    """What is there of a step, in the order of the paper's tasks and of the table's policies."""
-    names = [f"{step}-{task}{end}" for end in ("", *(f"-{p}" for p in (*RECIPES, *POLICIES))) for task in SETUPS]
-    files = [out / "units" / f"{name}.json" for name in names]
+def _trials(out: Path) -> list[dict[str, Any]]:
+    """The trials that are there, in the order of the paper's tasks and of the table's policies."""
+    files = [out / "units" / f"trials-{task}-{name}.json" for task in SETUPS for name in (*BASELINES, *POLICIES)]
     return [dict(json.loads(file.read_text())) for file in files if file.is_file()]
 
 
 def print_tables(out: Path) -> None:
     """The paper's table of real robots, with what is there; below it the labels, the demonstrations, the cost."""
-    trials = {(u["task"], u["policy"]): [t["success"] for t in u["tried"]] for u in _units(out, "trials")}
+    trials = {(u["task"], u["policy"]): [t["success"] for t in u["tried"]] for u in _trials(out)}
     tasks = [task for task in SETUPS if any(t == task for t, _ in trials)]
     _row("success [%]", *(f"{SETUPS[t].stands_for} ({t})" for t in tasks), "mean")
     _row(*["---"] * (len(tasks) + 2))
-    for name in POLICIES:
+    for name in (*BASELINES, *POLICIES):
         rates = [100 * _mean(trials[t, name]) if (t, name) in trials else None for t in tasks]
         whole = _mean([r for r in rates if r is not None]) if None not in rates else None
         _row(name, *("" if r is None else f"{r:.0f}" for r in rates), "" if whole is None else f"{whole:.1f}")
@@ -246,7 +247,7 @@ def _row_of_task(out: Path, task: str) -> None:
 
     wrong = f"{errors['confidently_wrong']:.2%}" if errors else ""
     spent = [json.loads(f.read_text())["cpu_s"] for f in (out / "units").glob("*.json") if f"-{task}" in f.stem]
-    solved = f"{films['replayed']} of {films['demonstrations']}"
+    solved = f"{films['repeated']} of {films['demonstrations']}"
     attempts = f"{films['demonstrations']} of {films['attempts']}"
     _row(task, attempts, films["frames"], solved, labels.get("episodes", ""), near("moving"), near("object"), wrong,
          f"{sum(spent):.0f}")  # fmt: skip
@@ -297,9 +298,12 @@ def main() -> None:
     if not asked.print:
         film = _film(asked.set)
         rehearsal = Rehearsal(asked.out, film, asked.demonstrations, asked.trials, asked.steps, asked.seed)
-        for task in asked.tasks:
-            rehearsal.do(task)
-            rehearsal.report()
+        try:
+            for task in asked.tasks:
+                rehearsal.do(task)
+                rehearsal.report()
+        except FlowlabError as error:
+            raise SystemExit(str(error)) from error
     print_tables(asked.out)
 
 

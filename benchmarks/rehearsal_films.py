@@ -1,6 +1,8 @@
 """Films of MetaWorld's experts as a real robot's demonstrations would be recorded, and their exact labels."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +13,7 @@ from scipy.spatial import cKDTree
 from flowlab import Rejected, Stage
 from flowlab.config import Settings
 from flowlab.demonstrations import QueriedDemo
+from flowlab.errors import DataError
 from flowlab.pipeline.stages.labeled import labeled
 from flowlab.provenance import Provenance
 from flowlab.recordings.recording import Recording
@@ -45,7 +48,7 @@ class Setup:
     stands_for: str
     """The paper's."""
     seed: int
-    """Of the layout: the first on which MetaWorld's expert solves eleven of twelve so moved."""
+    """Of the layout: the first on which MetaWorld's expert solves twelve of twelve so moved."""
     efforts: tuple[float, float]
     """Of its gripper, open and closed, as the expert has them; where he never moves it, both ends of the range."""
 
@@ -105,36 +108,50 @@ class Studio:
         x, y = np.random.default_rng([self.setup.seed, number]).uniform(-reach, reach, 2).tolist()
         return self.simulator.begin(self.setup.seed, (x, y))
 
+    def layouts(self, first: int) -> Iterator[int]:
+        """The numbers from one on whose layouts MetaWorld takes."""
+        for number in count(first):
+            try:
+                self.begin(number)
+            except DataError:
+                continue
+            yield number
+
     def sensor(self, number: int) -> "NoisyCamera":
         """The camera, with errors of its own for every layout."""
         return NoisyCamera(Sensor(PRESETS[self.settings.sensor], number))
 
     def demonstrate(self, number: int) -> Rollout | None:
-        """The expert's attempt, a row for every picture: state, and the action up to the next. None if it fails.
-
-        He acts at every control step, as an operator's hand moves between pictures; his gripper only opens or closes.
-        """
-        live, expert, arm = self.begin(number), Expert(self.simulator.simulation), self.arm
-        states, actions = [], []
-        while len(live.success) < MAX_STEPS and sum(live.success) < _HOLD:
-            states.append(arm.state)
-            start, effort = arm.target, 0.0
-            for _ in range(self.settings.every):
-                action = arm.binary(expert.act())
-                effort = float(action[3])
-                live.step(action)
-            actions.append(arm.action(start, effort))
+        """The expert's attempt, a row for every picture: state, and the action up to the next. None if it fails."""
+        live, states, actions = self.expert(number)
         if live.unstable or sum(live.success) < _HOLD:
             return None
         return _thinned(live.rollout(), self.settings.every, np.stack(states), np.stack(actions))
 
-    def replay(self, number: int, actions: np.ndarray) -> bool:
-        """Whether a demonstration's actions, carried out again on its layout without looking, solve the task."""
+    def expert(self, number: int) -> tuple[EpisodeRecorder, list[np.ndarray], list[np.ndarray]]:
+        """The expert's attempt, with the state before and the action after every picture.
+
+        He acts at every control step, as an operator's hand moves between pictures; his gripper only opens or closes.
+        """
+        live, expert, arm = self.begin(number), Expert(self.simulator.simulation), self.arm
+        states, actions = list[np.ndarray](), list[np.ndarray]()
+        while len(live.success) < MAX_STEPS and sum(live.success) < _HOLD:
+            states.append(arm.state)
+            start, effort = arm.target, 0.0
+            for _ in range(self.settings.every):
+                step = arm.binary(expert.act())
+                effort = float(step[3])
+                live.step(step)
+            actions.append(arm.action(start, effort))
+        return live, states, actions
+
+    def repeat(self, number: int, actions: np.ndarray) -> EpisodeRecorder:
+        """A demonstration's actions, carried out on a layout without looking."""
         live = self.begin(number)
         for action in actions:
             for step in self.arm.steps(action):
                 live.step(step)
-        return any(live.success)
+        return live
 
     def film(self, folder: Path, rollout: Rollout, number: int) -> None:
         """Write a demonstration as the camera saw it, a plain recording."""

@@ -45,10 +45,11 @@ def test_a_small_rehearsal_ends_in_a_table_goes_on_and_keeps_to_its_settings(tmp
     rows = (out / "trials.csv").read_text().splitlines()
     assert rows[0] == "policy,task,trial,success,note"
     assert [row.split(",")[:3] for row in rows[1:]] == [
-        [policy, "button-press", "01"] for policy in ("dp3", "fdp-exact", "fdp-estimated")
+        [policy, "button-press", "01"] for policy in ("expert", "repetition", "dp3", "fdp-exact", "fdp-estimated")
     ]
+    assert rows[1] == "expert,button-press,01,1,"
     assert (out / "report" / "report.html").is_file()
-    assert json.loads((out / "units" / "films-button-press.json").read_text())["replayed"] == 3
+    assert json.loads((out / "units" / "films-button-press.json").read_text())["repeated"] == 3
 
     estimated, exact = (flowlab.open_dataset(out / "data" / f"button-press-{k}") for k in ("estimated", "exact"))
     assert exact.provenance.tracks == "exact"
