@@ -80,13 +80,21 @@ def test_the_state_is_mujocos_pose_of_the_hand(assembly: Simulation) -> None:
     assert w >= 0
 
 
+def test_a_turn_has_one_quaternion(assembly: Simulation) -> None:
+    arm = an_arm(assembly)
+    state, turn = arm.state, assembly.data.body("hand").xquat
+    turn *= -1
+    assert np.array_equal(arm.state, state)
+    turn *= -1
+
+
 def test_an_action_sends_the_hand_where_it_says_at_a_centimeter_a_step(assembly: Simulation) -> None:
     arm = an_arm(assembly)
     start = arm.target
     near, far = start + np.array([0.02, -0.03, 0.01]), start + np.array([0.2, 0, 0])
-    for step in arm.steps(np.array([*near, *UNTURNED, 0])):
+    for k, step in enumerate(arm.steps(np.array([*near, *UNTURNED, 0])), 1):
         assembly.step(step)
-    assert np.allclose(assembly.data.mocap_pos[0], near, atol=1e-6)
+        assert np.allclose(assembly.data.mocap_pos[0], start + (near - start) * k / 3, atol=1e-6)
     assembly.reset(0)
     for step in arm.steps(np.array([*far, *UNTURNED, 0])):
         assembly.step(step)
