@@ -43,11 +43,11 @@ POLICIES = {"dp3": ("dp3", "estimated"), "fdp-exact": ("fdp", "exact"), "fdp-est
 BASELINES = {"expert": try_expert, "repetition": try_repetition}
 """Beside them: who is told where everything is, and who never looks."""
 RECIPES = {"estimated": ["real"], "exact": [str(Path(__file__).with_name("rehearsal_exact.yaml"))]}
-LABELING = (
+LABELING = [
     "observer.crop={low: [-0.5, 0.25, 0.015], high: [0.5, 0.97, 0.8]}",  # the table's top is at 0, and depth errs
     "write.depth=false",
     "write.rgb=false",
-)
+]
 TRAINING = ["batch.shift_m=0", "batch.turn_deg=0", "run.validations=2"]
 """As the paper has it for real robots: no augmentation."""
 MOST_ATTEMPTS = 3
@@ -65,22 +65,33 @@ class Rehearsal:
     steps: int
     seed: int
 
-    def unit(self, name: str, make: Callable[[], dict[str, Any]], **about: Any) -> dict[str, Any]:
+    def settle(self) -> None:
+        """Keep what was asked for beside what comes of it. Ends the program where something else was asked before."""
+        file, asked = self.out / "rehearsal.json", json.loads(json.dumps(self._settings()))
+        if not file.is_file():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_json(file, asked)
+        known = read_json(file)
+        if other := [k for k in asked if known.get(k) != asked[k]]:
+            raise SystemExit(
+                f"{file}: was begun with {other[0]} {known.get(other[0])}, and {asked[other[0]]} is asked for; choose "
+                "another --out"
+            )
+
+    def _settings(self) -> dict[str, Any]:
+        film = self.film.model_dump(mode="json")
+        numbers = {"demonstrations": self.demonstrations, "trials": self.trials, "steps": self.steps, "seed": self.seed}
+        return {"film": film, **numbers, "labeling": LABELING, "training": TRAINING}
+
+    def unit(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """What is known of a step, done where it is not: its file is there once it is done, and all of it."""
         path = self.out / "units" / f"{name}.json"
-        about = {"demonstrations": self.demonstrations, "film": json.loads(self.film.model_dump_json()), **about}
         if path.is_file():
-            known = dict(json.loads(path.read_text()))
-            if other := [k for k, v in about.items() if known.get(k) != v]:
-                raise SystemExit(
-                    f"{path}: was made with {other[0]} {known.get(other[0])}, and {about[other[0]]} is asked for; "
-                    "choose another --out"
-                )
-            return known
+            return dict(json.loads(path.read_text()))
         began = _cpu_s()
         made = make()
         spent = _cpu_s() - began + made.pop("workers_cpu_s", 0.0)
-        found = about | made | {"cpu_s": round(spent, 1), **_machine()}
+        found = made | {"cpu_s": round(spent, 1), **_machine()}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, found)
         print(f"{name}: {found['cpu_s']:.0f} CPU s", flush=True)
@@ -91,18 +102,18 @@ class Rehearsal:
         folder = self.out / "films" / task
 
         def make() -> dict[str, Any]:
-            studio, repeated, frames, number = self.film.stage(task, color=True), 0, list[int](), -1
-            for number in islice(studio.layouts(0), MOST_ATTEMPTS * self.demonstrations):
+            studio, repeated, frames = self.film.studio(task, color=True), 0, list[int]()
+            for attempts, number in enumerate(islice(studio.layouts(0), MOST_ATTEMPTS * self.demonstrations), 1):
+                rollout = studio.demonstrate(number)
+                if rollout is None:
+                    continue
+                repeated += any(studio.repeat(number, rollout.action).success)
+                frames.append(len(rollout))
+                if not (folder / f"{number:03d}").exists():
+                    studio.film(folder / f"{number:03d}", rollout, number)
                 if len(frames) == self.demonstrations:
-                    return {"attempts": number, "repeated": repeated, "frames": sum(frames)}
-                if (rollout := studio.demonstrate(number)) is not None:
-                    repeated += any(studio.repeat(number, rollout.action).success)
-                    frames.append(len(rollout))
-                    if not (folder / f"{number:03d}").exists():
-                        studio.film(folder / f"{number:03d}", rollout, number)
-            raise SystemExit(
-                f"{task}: MetaWorld's expert solved {len(frames)} layouts up to {number}; move objects less"
-            )
+                    return {"films": len(frames), "attempts": attempts, "repeated": repeated, "frames": sum(frames)}
+            raise SystemExit(f"{task}: MetaWorld's expert solves {len(frames)} of {attempts} layouts; lower moved_m")
 
         return self.unit(f"films-{task}", make)
 
@@ -140,18 +151,17 @@ class Rehearsal:
             _flowlab("train", data, *about, *_set([*TRAINING, f"run.steps={self.steps}"]))
             return {"channels": read_json(run / "policy.json")["policy"]["channels"]}
 
-        self.unit(f"train-{task}-{name}", make, training=TRAINING, steps=self.steps, seed=self.seed)
+        self.unit(f"train-{task}-{name}", make)
         return run
 
     def tried(self, task: str, name: str) -> dict[str, Any]:
         """How a policy of the table does, or what stands beside them."""
-        about = {"task": task, "policy": name, "trials": self.trials}
         if name in BASELINES:
-            make = partial(BASELINES[name], task, self.film, self.trials)
+            attempt = partial(BASELINES[name], task)
         else:
-            make = partial(try_policy, self.train(task, name), task, self.film, self.trials)
-            about |= {"steps": self.steps, "seed": self.seed}
-        return self.unit(f"trials-{task}-{name}", lambda: {"tried": make()}, **about)
+            attempt = partial(try_policy, self.train(task, name), task)
+        about = {"task": task, "policy": name}
+        return self.unit(f"trials-{task}-{name}", lambda: about | {"tried": attempt(self.film, self.trials)})
 
     def do(self, task: str) -> None:
         """All of a task."""
@@ -247,8 +257,7 @@ def _row_of_task(out: Path, task: str) -> None:
 
     wrong = f"{errors['confidently_wrong']:.2%}" if errors else ""
     spent = [json.loads(f.read_text())["cpu_s"] for f in (out / "units").glob("*.json") if f"-{task}" in f.stem]
-    solved = f"{films['repeated']} of {films['demonstrations']}"
-    attempts = f"{films['demonstrations']} of {films['attempts']}"
+    solved, attempts = f"{films['repeated']} of {films['films']}", f"{films['films']} of {films['attempts']}"
     _row(task, attempts, films["frames"], solved, labels.get("episodes", ""), near("moving"), near("object"), wrong,
          f"{sum(spent):.0f}")  # fmt: skip
 
@@ -299,6 +308,7 @@ def main() -> None:
         film = _film(asked.set)
         rehearsal = Rehearsal(asked.out, film, asked.demonstrations, asked.trials, asked.steps, asked.seed)
         try:
+            rehearsal.settle()
             for task in asked.tasks:
                 rehearsal.do(task)
                 rehearsal.report()

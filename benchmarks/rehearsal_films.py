@@ -82,7 +82,7 @@ class FilmSettings(Settings):
     moved_m: Annotated[float, Field(ge=0)] = 0.01
     """The object begins up to so much from its place along x and y [m]."""
 
-    def stage(self, task: str, *, color: bool) -> "Studio":
+    def studio(self, task: str, *, color: bool) -> "Studio":
         """A task before the camera; without color it needs no OpenGL."""
         camera = CameraSettings(width=self.size[0], height=self.size[1])
         renderer: Literal["gl", "zbuffer"] = "gl" if color else "zbuffer"
@@ -227,7 +227,7 @@ class ExactTracks(Stage):
     def _studio(self, task: str) -> Studio:
         if task not in _studios:
             _studios.clear()
-            _studios[task] = self.film.stage(task, color=False)
+            _studios[task] = self.film.studio(task, color=False)
         return _studios[task]
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:

@@ -43,17 +43,17 @@ def try_policy(run: Path, task: str, settings: FilmSettings, trials: int) -> lis
         How each went, as JSON values.
     """
     policy = Policy.load(run, task=task)
-    return _tried(settings.stage(task, color=False), trials, lambda studio, number: _drive(policy, studio, number))
+    return _tried(settings.studio(task, color=False), trials, lambda studio, number: _drive(policy, studio, number))
 
 
 def try_expert(task: str, settings: FilmSettings, trials: int) -> list[dict[str, Any]]:
     """The same by MetaWorld's expert, who is told where everything is."""
-    return _tried(settings.stage(task, color=False), trials, lambda studio, number: (studio.expert(number)[0], ""))
+    return _tried(settings.studio(task, color=False), trials, lambda studio, number: (studio.expert(number)[0], ""))
 
 
 def try_repetition(task: str, settings: FilmSettings, trials: int) -> list[dict[str, Any]]:
     """The same by the actions of the first demonstration, wherever the object is."""
-    studio = settings.stage(task, color=False)
+    studio = settings.studio(task, color=False)
     shown = next(r for number in studio.layouts(0) if (r := studio.demonstrate(number)) is not None)
     return _tried(studio, trials, lambda studio, number: (studio.repeat(number, shown.action), ""))
 

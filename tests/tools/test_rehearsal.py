@@ -69,7 +69,7 @@ def test_a_small_rehearsal_ends_in_a_table_goes_on_and_keeps_to_its_settings(tmp
 
     code, said = rehearse(out, "--set", "sensor=tof")
     assert code == 1
-    assert "films-button-press.json: was made with film" in said
+    assert "rehearsal.json: was begun with film" in said
     assert "choose another --out" in said
     code, said = rehearse(out, "--set", "senser=tof")
     assert "unknown setting 'senser'" in said
