@@ -48,7 +48,14 @@ LABELING = [
     "write.depth=false",
     "write.rgb=false",
 ]
-TRAINING = ["batch.shift_m=0", "batch.turn_deg=0", "batch.windows=32", "batch.segment=4", "run.validations=2"]
+TRAINING = [
+    "batch.shift_m=0",
+    "batch.turn_deg=0",
+    "batch.windows=32",
+    "batch.segment=4",
+    "run.validations=2",
+    "run.checkpoints=1",
+]
 """No augmentation, as the paper has it for real robots; small batches, with which short trainings get farther."""
 MOST_ATTEMPTS = 3
 """So many films are tried for each that is wanted, before a task is given up."""

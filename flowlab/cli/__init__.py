@@ -26,7 +26,7 @@ _COMMANDS = {
     "bench": ("flowlab.cli.bench:bench", "Run an experiment: extract, train, evaluate, report."),
     "report": ("flowlab.cli.report:report", "Write a report of evaluations, beside the paper's numbers."),
     "grade": ("flowlab.cli.grade:grade", "Measure the error of estimated tracks against known ones."),
-    "info": ("flowlab.cli.datasets:info", "Describe a dataset."),
+    "info": ("flowlab.cli.datasets:info", "Describe a dataset, or a training run."),
     "validate": ("flowlab.cli.datasets:validate", "Check a dataset, a run or an experiment."),
     "viz": ("flowlab.cli.viz:viz", "Draw an episode: a Rerun recording, a film or a PNG."),
     "merge": ("flowlab.cli.selection:merge", "Make one dataset of several."),
@@ -51,6 +51,14 @@ class _Commands(click.Group):
         module, _, attribute = _COMMANDS[cmd_name][0].partition(":")
         command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command that was asked for, which is never silent for long."""
+        from flowlab.cli.console import show
+        from flowlab.cli.heartbeat import beating
+
+        with beating(ctx, show):
+            return super().invoke(ctx)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

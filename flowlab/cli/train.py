@@ -7,8 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import STEPS_LINE, ProgressBar, echo, print_json, print_table, say, show_training
+from flowlab.cli.console import (
+    STEPS_LINE,
+    ProgressBar,
+    echo,
+    json_option,
+    print_json,
+    print_table,
+    quiet_option,
+    say,
+    show_training,
+)
+from flowlab.cli.heartbeat import be_quiet
 from flowlab.cli.paths import PATH, PATH_OR_HUB
+from flowlab.cli.values import Names, PluginName, flat, installed
 from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
@@ -21,7 +33,7 @@ class PluginOption(click.Option):
     """An option whose value is a name of a registry: its help lists those that are installed."""
 
     def __init__(self, *declarations: Any, registry: Registry[Any], **attributes: Any) -> None:
-        super().__init__(*declarations, **attributes)
+        super().__init__(*declarations, **({"type": PluginName(registry)} | attributes))
         self._registry = registry
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
@@ -33,6 +45,9 @@ class PluginOption(click.Option):
 
 @click.command()
 @click.argument("sources", type=PATH_OR_HUB, nargs=-1, required=True, metavar="SOURCE...")
+@click.option(
+    "--weights", metavar="W,W,...", help="Of several datasets, the share of windows that each has: 0.7,0.3 or 7,3."
+)
 @click.option("--policy", cls=PluginOption, registry=POLICIES, help="What to train.")
 @click.option("--out", type=PATH, help="Folder of the run.")
 @click.option("--profile", help="fast, paper, or a YAML file with the settings that differ  [fast].")
@@ -46,11 +61,14 @@ class PluginOption(click.Option):
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads of each process  [1].")
 @click.option("--precision", type=click.Choice(["fp32", "bf16"]), help="[bf16 where the device has units for it].")
 @click.option(
-    "--log", "logs", cls=PluginOption, registry=LOGGERS, multiple=True, metavar="NAME", help="Also log there."
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
+    "--log", "logs", cls=PluginOption, registry=LOGGERS, type=Names(installed(LOGGERS)), callback=flat, multiple=True,
+    metavar="NAME,...", help="Also log there.",
+)  # fmt: skip
+@quiet_option
+@json_option
 def train(
     sources: tuple[Path, ...],
+    weights: str | None,
     policy: str | None,
     out: Path | None,
     profile: str | None,
@@ -72,6 +90,7 @@ def train(
       flowlab train data/push --policy fdp --out runs/push-fdp
       flowlab train data/push --policy dp3 --profile paper --out runs/push-dp3
       flowlab train data/push data/films-labeled --policy dp3 --out runs/push-all
+      flowlab train data/push data/films-labeled --weights 0.7,0.3 --policy dp3 --out runs/push-all
       flowlab train hub:user/pour@1.0 --policy fdp --out runs/pour-fdp
       flowlab train runs/push-fdp --resume
       torchrun --nproc-per-node 4 -m flowlab train data/push --policy fdp --out runs/push-fdp
@@ -80,6 +99,9 @@ def train(
     must say the same of their frame, their camera, and what their numbers mean. hub:user/name is a dataset on the
     Hugging Face Hub, which is pulled into the cache first; 'flowlab hub pull' does it without training.
 
+    All windows of several datasets are drawn alike, so that the larger ones have more of them; with --weights each
+    dataset has its share, whatever its size. The numbers are in the order of the datasets, and need not add up to 1.
+
     --minutes is CPU time of one thread, so that what else the machine does changes nothing; on a GPU it is time by
     the clock. The learning rate falls to zero within it.
 
@@ -87,7 +109,7 @@ def train(
     """
     if resume:
         given = {"--policy": policy, "--out": out, "--profile": profile, "--minutes": minutes, "--set": overrides,
-                 "--seed": seed, "--overfit": overfit, "--from": began_from}  # fmt: skip
+                 "--seed": seed, "--overfit": overfit, "--from": began_from, "--weights": weights}  # fmt: skip
         if changed := [name for name, value in given.items() if value not in (None, ())]:
             raise UsageError(f"--resume goes on as the run began, so leave out {', '.join(changed)}")
         if len(sources) > 1:
@@ -99,13 +121,19 @@ def train(
             f"say what to train and where to save it, as in 'flowlab train {sources[0]} --policy fdp --out runs/fdp'; "
             "--resume goes on with a run"
         )
+    else:
+        from flowlab.training.request import check_request
+
+        timed = minutes is not None
+        check_request(sources, policy=policy, profile=profile or "fast", settings=overrides, timed=timed, logs=logs)
     from flowlab.training import train as training
     from flowlab.training.distributed import is_first_process
 
     first = is_first_process()
-    quiet = as_json or not first
-    with ProgressBar(quiet, STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
-        watch = training.Watch(_silent if quiet else say, partial(show_training, bar), should_stop)
+    if not first:
+        be_quiet()
+    with ProgressBar(STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
+        watch = training.Watch(say, partial(show_training, bar), should_stop)
         if resume:
             done = training.resume(
                 sources[0], device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
@@ -116,7 +144,7 @@ def train(
             done = training.train(
                 sources, out, policy=policy, profile=profile or "fast", minutes=minutes, settings=overrides, seed=seed,
                 overfit=overfit, began_from=began_from, device=device or "auto", threads=threads or 1,
-                precision=precision or "auto", logs=logs, watch=watch,
+                precision=precision or "auto", logs=logs, watch=watch, weights=_numbers(weights),
             )  # fmt: skip
     if first:
         _print(done, as_json)
@@ -124,8 +152,14 @@ def train(
         sys.exit(130)
 
 
-def _silent(text: str) -> None:
-    """Not in JSON, nor in other processes than the first."""
+def _numbers(text: str | None) -> list[float] | None:
+    """Numbers with commas between them."""
+    if text is None:
+        return None
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise UsageError(f"--weights {text}: must be numbers with commas between them, as in 0.7,0.3") from error
 
 
 def _print(done: "TrainedRun", as_json: bool) -> None:

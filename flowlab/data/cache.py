@@ -225,9 +225,12 @@ class _Decoder:
         stop = start + len(e)
         if stop > self.source.frames:
             raise DataError(f"{self.source.path}: holds more frames than its receipts say, {self.source.frames}")
+        where, first = self._dataset_of(start), self._dataset_of(0)
         if self.episodes and (odd := sorted(self.arrays.keys() ^ per_frame.keys())):
+            here = "here, and not" if odd[0] in per_frame else "not here, and"
+            told = "" if where == first else f" ({here} in {first})"
             raise DataError(
-                f"{self.source.path}: {e.task} seed {e.seed}: '{odd[0]}' is in some episodes only; train on those that "
+                f"{where}: {e.task} seed {e.seed}: '{odd[0]}' is in some episodes only{told}; train on those that "
                 "have it, or on the others"
             )
         for name, values in per_frame.items():
@@ -236,12 +239,21 @@ class _Decoder:
                 self.arrays[name] = _create(self.folder / f"{name}.npy", values.dtype, shape)
             if values.shape[1:] != self.arrays[name].shape[1:]:
                 raise DataError(
-                    f"{self.source.path}: {e.task} seed {e.seed}: '{name}' is {values.shape[1:]} wide, in those "
-                    f"before {self.arrays[name].shape[1:]}; train on one of them at a time"
+                    f"{where}: {e.task} seed {e.seed}: '{name}' is {values.shape[1:]} wide, in those before"
+                    f"{'' if where == first else f', of {first},'} {self.arrays[name].shape[1:]}; train on one of them "
+                    "at a time"
                 )
             self.arrays[name][start:stop] = values
         self.episodes.append(CachedEpisode(task=e.task, seed=e.seed, start=start, stop=stop))
         self.whole.append(per_episode)
+
+    def _dataset_of(self, row: int) -> Path:
+        """Where the episode with a row lies."""
+        for part in self.source.parts:
+            if row < part.frames:
+                return part.path
+            row -= part.frames
+        return self.source.path
 
     def finish(self) -> None:
         """Write what is still to be written, the index last."""

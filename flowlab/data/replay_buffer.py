@@ -1,7 +1,7 @@
 """The demonstrations as training reads them: decoded once, then mapped into memory."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +25,11 @@ class EpisodeSlice:
     start: int
     stop: int
     """Its rows are ``start`` to ``stop - 1``."""
+    origin: int = 0
+    """Which dataset it is from, where there are several: its position in :attr:`TrainingSource.parts`."""
+    scene: str = ""
+    """What its scene is known by in the other datasets; empty where that is not known, or where there is one dataset.
+    Those of one task that are called alike show the same layout, or are labels of the same recording."""
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -84,9 +89,18 @@ def load_buffer(source: TrainingSource, fallback: Path, pictures: Sequence[str] 
         DataError: Neither folder can be written, or the episodes are of different widths.
     """
     episodes, arrays = open_part(cached_part(source, fallback, ARRAYS, arrays_of))
-    slices = tuple(EpisodeSlice(**e) for e in episodes)
+    slices = tuple(_with_origin(EpisodeSlice(**e), source) for e in episodes)
     known = {name: array for name, array in arrays.items() if name in ReplayBuffer.__dataclass_fields__}
     return ReplayBuffer(slices, **known, **load_pictures(source, fallback, pictures))
+
+
+def _with_origin(e: EpisodeSlice, source: TrainingSource) -> EpisodeSlice:
+    """A demonstration that knows its dataset: the rows of each lie behind those of the one before."""
+    if not source.parts:
+        return e
+    ends = np.cumsum([part.frames for part in source.parts])
+    origin = int(np.searchsorted(ends, e.start, side="right"))
+    return replace(e, origin=origin, scene=source.parts[origin].scenes.get((e.task, e.seed), ""))
 
 
 def load_pictures(source: TrainingSource, fallback: Path, names: Sequence[str]) -> dict[str, np.ndarray]:

@@ -2,8 +2,8 @@
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
@@ -11,13 +11,27 @@ from flowlab.arguments import check_path
 from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
-from flowlab.storage.compatibility import check_alike
+from flowlab.storage.compatibility import check_alike, check_trained_together, known_scenes
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
 from flowlab.storage.trainable import training_problems
 
 _LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class SourcePart:
+    """One of the datasets that are trained on together."""
+
+    path: Path
+    fingerprint: str
+    frames: int
+    """Its episodes have so many rows."""
+    scenes: Mapping[tuple[str, int], str]
+    """What the scenes of its episodes are known by in the other datasets, by task and seed, as far as that is known."""
+    hub: str
+    """Where on the Hub it was pulled from, ``user/name@commit``; empty where it was not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,23 +46,29 @@ class TrainingSource:
     provenance: Provenance
     cache_key: str
     """Identifies what is read, the names of tasks too."""
-    more: tuple[Path, ...] = ()
-    """Where the rest of it is, if there are several datasets."""
+    parts: tuple[SourcePart, ...] = field(default=(), kw_only=True)
+    """The datasets, if there are several; their episodes are read one dataset after the other."""
 
     @property
     def paths(self) -> tuple[Path, ...]:
         """Where all of it is."""
-        return self.path, *self.more
+        return tuple(part.path for part in self.parts) or (self.path,)
 
 
-def open_training_source(path: Path, *more: Path) -> TrainingSource:
+def open_training_source(path: Path, *more: Path, known: bool = False) -> TrainingSource:
     """Open a dataset, or a store in DP3's layout; or several datasets, to be trained on together.
+
+    Args:
+        path: Where it is.
+        more: Where the other datasets are.
+        known: A run was trained on them, perhaps by an earlier flowlab, which did not ask for their rates, nor whether
+            they share episodes.
 
     Raises:
         DataError: A folder is neither, or holds no episodes, or the datasets do not fit each other.
     """
     if more:
-        return _joined([Dataset(p) for p in (path, *more)])
+        return _joined([_dataset_at(p) for p in (path, *more)], check_alike if known else check_trained_together)
     if DP3Store.looks_like(path):
         store = DP3Store(path)
         named = hashlib.sha256(f"{store.fingerprint} {store.task}".encode()).hexdigest()[:16]  # after the folder
@@ -57,11 +77,25 @@ def open_training_source(path: Path, *more: Path) -> TrainingSource:
     return source_of(Dataset(path))
 
 
-def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
+def _dataset_at(path: Path) -> Dataset:
+    """One of several datasets."""
+    if DP3Store.looks_like(path):
+        raise DataError(
+            f"{path}: a store in DP3's layout does not tell its frame, its camera or what its numbers mean, and "
+            "datasets that are trained on together must agree in these; train on it alone"
+        )
+    return Dataset(path)
+
+
+def _joined(datasets: Sequence[Dataset], check: Callable[[Sequence[Dataset]], None]) -> TrainingSource:
     """Several datasets as one. Where episodes come from, and what their numbers mean, must be the same."""
     first, sources = datasets[0], [source_of(d) for d in datasets]
-    check_alike(datasets, "trained on together with")
+    check(datasets)
     content = hashlib.sha256(" ".join(s.fingerprint for s in sources).encode()).hexdigest()[:16]
+    parts = tuple(
+        SourcePart(d.path, s.fingerprint, s.frames, known_scenes(d), s.provenance.hub)
+        for d, s in zip(datasets, sources, strict=True)
+    )
     return TrainingSource(
         first.path,
         content,
@@ -69,8 +103,21 @@ def _joined(datasets: Sequence[Dataset]) -> TrainingSource:
         lambda: chain.from_iterable(s.episodes() for s in sources),
         first.provenance,
         content,
-        tuple(d.path for d in datasets[1:]),
+        parts=parts,
     )
+
+
+def warn_of_shared_scenes(parts: Sequence[SourcePart]) -> None:
+    """Warn of datasets that show one scene in different episodes: films of it, say, or labels of another tracker."""
+    owners: dict[tuple[str, str], Path] = {}
+    for part in parts:
+        scenes = [(task, scene) for (task, _), scene in part.scenes.items()]
+        if shared := [scene for scene in scenes if scene in owners]:
+            _LOG.warning(
+                "flowlab: %s: %d of its scenes are in %s, too, as other episodes; where one of these is held out, the "
+                "other is not trained on", part.path, len(shared), owners[shared[0]],
+            )  # fmt: skip
+        owners |= dict.fromkeys(scenes, part.path)
 
 
 def path_of(data: Dataset | Path | str) -> Path:

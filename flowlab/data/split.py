@@ -12,7 +12,7 @@ def split_episodes(
     """Of each task the last few are held out, at most a third, and of the others the first so many are trained on.
 
     What is held out tells how good a policy is, so its actions are recorded ones; inferred ones are held out only of a
-    task that has no others.
+    task that has no others. Nothing is trained on whose scene another dataset's held-out demonstration shows.
 
     Args:
         episodes: All that there are.
@@ -28,6 +28,8 @@ def split_episodes(
         of_task = [k for k, e in enumerate(episodes) if e.task == task]
         sure = [k for k in of_task if k not in inferred] or of_task
         last = len(sure) - min(settings.held_out, len(sure) // 3)
-        train += [k for k in of_task if k not in sure[last:]][: settings.demonstrations]
+        known = {episodes[k].scene for k in sure[last:]} - {""}
+        free = [k for k in of_task if k not in sure[last:] and episodes[k].scene not in known]
+        train += free[: settings.demonstrations]
         held += sure[last:]
     return train, held

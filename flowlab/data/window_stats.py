@@ -7,11 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flowlab.storage.pictures import StoredPictures
+
 _ROWS = 64
 """Rows that are looked at together, so that pictures need not fit into memory."""
 
 
-def describe_rows(key: str, array: np.ndarray, ends: Sequence[int]) -> dict[str, Tensor]:
+def describe_rows(key: str, array: np.ndarray | StoredPictures, ends: Sequence[int]) -> dict[str, Tensor]:
     """Least and greatest value, mean and deviation of an array (F, ...), per channel.
 
     The channel is the last axis, but for pictures: of ``rgb`` the three colors from 0 to 1, shape (3, 1, 1), and of
@@ -32,11 +34,11 @@ def describe_rows(key: str, array: np.ndarray, ends: Sequence[int]) -> dict[str,
     return {name: torch.from_numpy(np.asarray(v, np.float32).reshape(shape)) for name, v in found.items()}
 
 
-def _portions(array: np.ndarray) -> Iterator[np.ndarray]:
+def _portions(array: np.ndarray | StoredPictures) -> Iterator[np.ndarray]:
     yield from (array[start : start + _ROWS] for start in range(0, len(array), _ROWS))
 
 
-def _steps(tracks: np.ndarray, ends: Sequence[int]) -> Iterator[np.ndarray]:
+def _steps(tracks: np.ndarray | StoredPictures, ends: Sequence[int]) -> Iterator[np.ndarray]:
     yield from (np.diff(tracks[start:stop], axis=0) for start, stop in pairwise([0, *ends]))
 
 

@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +12,17 @@ from jaxtyping import Int
 from torch import Tensor
 
 from flowlab.data.cache import cached_part, open_part
-from flowlab.data.replay_buffer import ARRAYS, arrays_of, pictures_of
+from flowlab.data.replay_buffer import ARRAYS, arrays_of
 from flowlab.data.source import TrainingSource, open_training_source, source_of
 from flowlab.data.window_arguments import choose_episodes, finite_numbers, one_of, shown
+from flowlab.data.window_pictures import Where, WindowPictures
 from flowlab.data.window_stats import describe_rows
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import EpisodeSequence
+from flowlab.storage.importers.dp3 import DP3Store
+from flowlab.storage.pictures import StoredPictures
 
-PICTURES = ("rgb", "depth")
 _PER_EPISODE = ("queries", "query_role", "query_count", "estimated")
 _UNKNOWN_IN_IMPORTS = ("success", "time")
 """What a store in DP3's layout does not tell."""
@@ -54,10 +56,14 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         episodes: Which episodes, by their position in ``data``, in order of task and seed; None is all of them.
         tolerance_s: How far a time may be from that of a row [s].
         cache: Folder for the decoded arrays where the user's cache folder cannot be written.
+        pictures: ``stored`` reads pictures from the shards as windows are asked for, no others than theirs; ``decoded``
+            decodes all of them first, into the cache folder, where they are large and read more quickly. None is
+            ``stored``, but for datasets of earlier versions, which stored up to 256 pictures together.
 
     Raises:
         UsageError: A key, an offset or an episode does not exist, or a time is that of no row.
-        DataError: The dataset cannot be read, or its rows are not evenly spaced in time where that matters.
+        DataError: The dataset cannot be read, has no pictures where some are asked for, or its rows are not evenly
+            spaced in time where that matters.
     """
 
     def __init__(
@@ -69,15 +75,17 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         episodes: Sequence[int] | None = None,
         tolerance_s: float = 1e-4,
         cache: Path | str | None = None,
+        pictures: Where | None = None,
     ) -> None:
         asked = one_of(offsets, delta_timestamps)
-        source, among = _opened(data)
+        source, dataset, among = _opened(data)
         fallback = None if cache is None else Path(cache)
         self.path = source.path
         self._folders = [cached_part(source, fallback, ARRAYS, arrays_of)]
         every, arrays = open_part(self._folders[0])
         self._all_ends = sorted(e["stop"] for e in every)
-        self._find_pictures(source, fallback, asked)
+        self._pictures = WindowPictures(source, dataset, asked, pictures, fallback)
+        self._folders += self._pictures.folders
         self.keys = self._known(arrays, source)
         """Names of everything that can be asked for."""
         for key in asked:
@@ -120,7 +128,11 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         for key, offsets in self.offsets.items():
             wanted = episode["start"] + frame + offsets
             rows = np.clip(wanted, episode["start"], episode["stop"] - 1)
-            item[key] = self._read(key, rows, episode["stop"] - 1)
+            if key in self._pictures.stored:
+                values = self._pictures.rows(key, self.episodes[k], rows - episode["start"])
+            else:
+                values = self._read(key, rows, episode["stop"] - 1)
+            item[key] = _as_tensor(key, values)
             unknown = (wanted == episode["stop"] - 1) & (key == "flow")
             item[f"{key}_is_pad"] = torch.from_numpy((wanted != rows) | unknown)
         return item
@@ -142,27 +154,20 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
     def stats(self) -> dict[str, dict[str, Tensor]]:
         """``min``, ``max``, ``mean`` and ``std`` of every key that is asked for and is no yes or no, over all episodes
         of the dataset: per channel, so of shape (3,) for clouds, and of pictures as they are handed out."""
-        about = {k: self._arrays["tracks" if k == "flow" else k] for k in self.offsets}
+        arrays: dict[str, np.ndarray | StoredPictures] = {**self._arrays, **self._pictures.stored}
+        about = {k: arrays["tracks" if k == "flow" else k] for k in self.offsets}
         return {k: describe_rows(k, values, self._all_ends) for k, values in about.items() if values.dtype != bool}
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
         return {name: array for folder in self._folders for name, array in open_part(folder)[1].items()}
 
-    def _read(self, key: str, rows: Int[np.ndarray, "T"], last: int) -> Tensor:
+    def _read(self, key: str, rows: Int[np.ndarray, "T"], last: int) -> np.ndarray:
+        """Rows of what is mapped into memory; flow is that of an episode that ends with the row ``last``."""
         if key == "flow":
             tracks = self._arrays["tracks"]
-            return torch.from_numpy(tracks[np.minimum(rows + 1, last)] - tracks[rows])
-        values = torch.from_numpy(np.array(self._arrays[key][rows]))
-        if key == "rgb":
-            return values.permute(0, 3, 1, 2).float() / 255
-        return values[:, None] if key == "depth" else values
-
-    def _find_pictures(self, source: TrainingSource, fallback: Path | None, asked: Mapping[str, Any]) -> None:
-        """Decode the pictures that are asked for."""
-        for name in PICTURES:
-            if name in asked:
-                self._folders.append(cached_part(source, fallback, name, partial(pictures_of, name=name)))
+            return tracks[np.minimum(rows + 1, last)] - tracks[rows]
+        return np.array(self._arrays[key][rows])
 
     def _known(self, arrays: Mapping[str, np.ndarray], source: TrainingSource) -> tuple[str, ...]:
         """What can be asked for: arrays that are not empty, flow where there are tracks, and pictures that were
@@ -172,9 +177,7 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         names -= {"action_sigma"} if not arrays["action_sigma"].any() else set()
         names |= {"flow"} if "tracks" in names else set()
         names -= set(_UNKNOWN_IN_IMPORTS) if source.provenance.kind == "imported" else set()
-        for folder in self._folders[1:]:
-            names |= set(open_part(folder)[1])
-        return tuple(sorted(names))
+        return tuple(sorted(names | set(self._pictures.kinds)))
 
     def _times_to_rows(
         self, key: str, times: Sequence[float], source: TrainingSource, tolerance_s: float
@@ -218,14 +221,25 @@ class Windows(torch.utils.data.Dataset[dict[str, Any]]):
         return step
 
 
-def _opened(data: EpisodeSequence | Path | str) -> tuple[TrainingSource, list[int] | None]:
-    """What is read, and the positions in it of the episodes that were given; None is all of them."""
+def _as_tensor(key: str, values: np.ndarray) -> Tensor:
+    """Rows as windows hand them out: of pictures the channels come first, and colors are from 0 to 1."""
+    rows = torch.from_numpy(values)
+    if key == "rgb":
+        return rows.permute(0, 3, 1, 2).float() / 255
+    return rows[:, None] if key == "depth" else rows
+
+
+def _opened(data: EpisodeSequence | Path | str) -> tuple[TrainingSource, Dataset | None, list[int] | None]:
+    """What is read, the dataset where it is one, and the positions in it of the episodes that were given; None is all
+    of them."""
     if isinstance(data, Dataset):
-        return source_of(data), None
+        return source_of(data), data, None
     if isinstance(data, EpisodeSequence):
         dataset = Dataset(data.path)
         position = {ref: k for k, ref in enumerate(dataset.refs)}
-        return source_of(dataset), [position[ref] for ref in data.refs]
+        return source_of(dataset), dataset, [position[ref] for ref in data.refs]
     if not isinstance(data, str | Path):
         raise UsageError(f"Windows: data must be a dataset or its path, as in 'data/push'; found {shown(data)}")
-    return open_training_source(Path(data)), None
+    if DP3Store.looks_like(Path(data)):
+        return open_training_source(Path(data)), None, None
+    return _opened(Dataset(data))

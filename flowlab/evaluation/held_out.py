@@ -53,7 +53,7 @@ def _open_source(loaded: LoadedPolicy, run: Path, data: Path | None) -> Training
     for path in paths:
         if not is_there(path):
             raise DataError(f"{run}: its dataset is no longer at {path}; give where it is now with --data")
-    source = open_training_source(*paths)
+    source = open_training_source(*paths, known=True)
     if source.fingerprint != loaded.trained.fingerprint:
         raise DataError(
             f"{run}: was trained on content {loaded.trained.fingerprint} of {source.path}, now {source.fingerprint}; "
@@ -133,6 +133,7 @@ def _select(buffer: ReplayBuffer, demos: Sequence[int]) -> ReplayBuffer:
 
 def _cameras(paths: Sequence[Path], buffer: ReplayBuffer) -> tuple[Camera | None, ...]:
     """The camera of every demonstration that has one for all of its rows: a simulated dataset's, or its recording's."""
-    shards = {(r.task, r.seed): path / r.shard for path in paths for r in Dataset(path).refs}
-    cameras = {shard: Shard(shard).camera for shard in {shards[d.task, d.seed] for d in buffer.episodes}}
-    return tuple(cameras[shards[d.task, d.seed]] for d in buffer.episodes)
+    shards = {(k, r.task, r.seed): path / r.shard for k, path in enumerate(paths) for r in Dataset(path).refs}
+    of_demos = [shards[d.origin, d.task, d.seed] for d in buffer.episodes]
+    cameras = {shard: Shard(shard).camera for shard in {*of_demos}}
+    return tuple(cameras[shard] for shard in of_demos)

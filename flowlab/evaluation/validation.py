@@ -67,7 +67,7 @@ def _check_plan(path: Path) -> None:
     for place in planned.datasets:
         if not is_there(place):
             raise DataError(f"{path / RUN}: dataset: {place} is not there; restore it, or change where it is")
-    if (found := open_training_source(*planned.datasets).fingerprint) != trained.fingerprint:
+    if (found := open_training_source(*planned.datasets, known=True).fingerprint) != trained.fingerprint:
         raise DataError(
             f"{planned.dataset}: its content is {found}, and {path} was trained on {trained.fingerprint}; restore it"
         )

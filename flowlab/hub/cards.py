@@ -5,9 +5,11 @@ from typing import Any
 
 import yaml
 
+from flowlab.data.mixture import dataset_shares
 from flowlab.hub.names import HubName
 from flowlab.hub.repo_layout import PICTURE
 from flowlab.policies.checkpoint import TrainedPolicy
+from flowlab.storage.card import without_mark
 from flowlab.storage.dataset import Dataset
 from flowlab.text import markdown, one_line
 
@@ -56,7 +58,7 @@ def dataset_page(name: HubName, dataset: Dataset, card: str, *, picture: bool) -
         "size_categories": [next((size for most, size in _SIZES if frames < most), "n>10M")],
         "viewer": False,  # it shows tables only
     }
-    rest = card.partition("---\n")[2].partition("---\n")[2].partition("\n")[2].lstrip()
+    rest = without_mark(card).partition("---\n")[2].partition("---\n")[2].partition("\n")[2].lstrip()
     return _front(head) + _filled(_DATASET, name, about.license, picture, rest=rest)
 
 
@@ -74,10 +76,16 @@ def policy_page(name: HubName, trained: TrainedPolicy, step: int, datasets: Sequ
     values = {
         "policy": markdown(policy),
         "step": f"{step:,}",
-        "dataset": markdown(trained.dataset),
+        "dataset": ", ".join(markdown(name) for name in _learned_from(trained)),
         "tasks": ", ".join(map(markdown, trained.policy.tasks)),
     }
     return _front(head) + _filled(_POLICY, name, trained.license, picture, **values)
+
+
+def _learned_from(trained: TrainedPolicy) -> list[str]:
+    """What a policy learned from, with the shares of several datasets that had weights."""
+    mixed = dataset_shares(trained.mixture, trained.dataset)
+    return [f"{one.name} ({one.share:.4g} of the windows)" for one in mixed] or [trained.dataset]
 
 
 def _tags(names: Sequence[str]) -> list[str]:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from flowlab.checksums import json_checksum, without_checksum
 from flowlab.config import Settings, explain, later
+from flowlab.data.mixture import MixedDataset
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, FlowlabError, UsageError
@@ -64,9 +65,13 @@ class TrainedPolicy(Settings):
     """Under which others may use it, as the Hugging Face Hub names licenses; empty where nobody has said."""
     hub: Annotated[str, later("")] = ""
     """Where on the Hub it was pulled from, with the commit: ``user/name@commit``; empty where it was not."""
+    mixture: Annotated[tuple[MixedDataset, ...], later(())] = ()
+    """The datasets in the order of ``dataset``, where each had a weight."""
 
     @classmethod
-    def now(cls, policy: PolicySpec, source: TrainingSource, buffer: ReplayBuffer) -> "TrainedPolicy":
+    def now(
+        cls, policy: PolicySpec, source: TrainingSource, buffer: ReplayBuffer, mixture: tuple[MixedDataset, ...] = ()
+    ) -> "TrainedPolicy":
         """A policy trained on a source by this flowlab."""
         about = source.provenance
         seeds = {t: tuple(e.seed for e in buffer.episodes if e.task == t) for t in buffer.tasks}
@@ -77,6 +82,7 @@ class TrainedPolicy(Settings):
             scene_seeds=seeds if about.is_simulated else {},
             scene=about.scene,
             versions={"flowlab": __version__, "torch": torch.__version__, "numpy": numpy.__version__},
+            mixture=mixture,
         )
 
 

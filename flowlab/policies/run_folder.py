@@ -4,12 +4,15 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from pydantic import model_validator
 from torch import Tensor
 
 from flowlab.checksums import with_checksum
-from flowlab.config import Settings
+from flowlab.config import Settings, later
+from flowlab.data.mixture import Weight
 from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers, write_json
 from flowlab.policies.checkpoint import (
@@ -52,6 +55,14 @@ class RunConfig(Settings):
     """Checkpoint that the first weights are from."""
     overfit: int | None = None
     """How many demonstrations are trained on and validated on, where they are the same."""
+    weights: Annotated[tuple[Weight, ...], later(())] = ()
+    """Of the datasets, in their order; empty where all windows are drawn alike."""
+
+    @model_validator(mode="after")
+    def _one_for_each(self) -> "RunConfig":
+        if self.weights and len(self.weights) != len(self.datasets):
+            raise ValueError(f"weights: there are {len(self.weights)} for {len(self.datasets)} datasets")
+        return self
 
     @property
     def datasets(self) -> tuple[Path, ...]:

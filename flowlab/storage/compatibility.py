@@ -1,19 +1,27 @@
 """Whether several datasets say the same of themselves, so that they can be one."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
 
 from flowlab.errors import DataError
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import differences
-from flowlab.text import cut
+from flowlab.storage.shard import Shard
+from flowlab.text import counted, cut
 
 ALIKE = ("kind", "world_frame", "camera", "state", "action", "action_limits", "observer", "queries")
 """What datasets must say alike of themselves to be trained on together."""
+_TRAINING = "trained on together with"
 _SHOWN = 300
 """Letters of the first difference."""
+_TIMED = 8
+"""So many episodes tell how far apart in time the rows of a dataset are."""
+_RATES_DIFFER = 1.05
+"""Clocks of cameras differ by less; what is farther apart was recorded at another rate."""
 
 
-def check_alike(datasets: Sequence[Dataset], doing: str, said: Sequence[str] = ALIKE) -> None:
+def check_alike(datasets: Sequence[Dataset], doing: str = _TRAINING, said: Sequence[str] = ALIKE) -> None:
     """Refuse datasets of which one is given twice, or that differ in what must be alike.
 
     Args:
@@ -34,3 +42,55 @@ def check_alike(datasets: Sequence[Dataset], doing: str, said: Sequence[str] = A
         assert other.row_format is not None
         if problem := first.row_format.problem(other.row_format) or (cut(lines[0], _SHOWN) if lines else ""):
             raise DataError(f"{other.path}: cannot be {doing} {first.path}: {problem}")
+
+
+def check_trained_together(datasets: Sequence[Dataset]) -> None:
+    """The same of datasets that one policy is to learn from: they must also have one rate, and share no episode.
+
+    Raises:
+        DataError: They do not fit each other; says in what, with both values.
+    """
+    check_alike(datasets)
+    _check_rates(datasets)
+    for k, other in enumerate(datasets[1:], 1):
+        mine = {ref.digest for ref in other.refs}
+        for first in datasets[:k]:
+            if shared := sum(ref.digest in mine for ref in first.refs):
+                raise DataError(
+                    f"{other.path}: {shared} of its {counted(len(other), 'episode')} are in {first.path}, too, and "
+                    f"would count twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
+                )
+
+
+def known_scenes(dataset: Dataset) -> Mapping[tuple[str, int], str]:
+    """What the scenes of episodes are known by in other datasets, by task and seed: the seed of a simulated one, the
+    content of a recording. What is not known is left out."""
+    if dataset.provenance.is_simulated:
+        return {(ref.task, ref.seed): str(ref.seed) for ref in dataset.refs}
+    content = {(r.task, r.seed): r.content for r in dataset.manifest.recordings if r.content}
+    return {key: content[key] for ref in dataset.refs if (key := (ref.task, ref.seed)) in content}
+
+
+def _check_rates(datasets: Sequence[Dataset]) -> None:
+    """Refuse datasets of other rates: a step of an action, and of flow, takes another time in each."""
+    timed = [(d, period) for d in datasets if (period := _row_period_s(d)) is not None]
+    for other, period in timed[1:]:
+        first, expected = timed[0]
+        if not 1 / _RATES_DIFFER < period / expected < _RATES_DIFFER:
+            raise DataError(
+                f"{other.path}: cannot be {_TRAINING} {first.path}: time: a step takes {period:.4g} s in "
+                f"{other.path}, and {expected:.4g} s in {first.path}; make the quicker one again of fewer frames "
+                "(track-real --set recording.every=3), or train on one of them"
+            )
+
+
+def _row_period_s(dataset: Dataset) -> float | None:
+    """How far apart in time the rows are, in the median of some episodes; None where no episode has two."""
+    steps = np.concatenate([np.empty(0), *_steps_s(dataset)])
+    return float(np.median(steps)) if len(steps) and np.median(steps) > 0 else None
+
+
+def _steps_s(dataset: Dataset) -> Iterator[np.ndarray]:
+    for ref in dataset.refs[:: -(-len(dataset) // _TIMED)]:
+        shard = Shard(dataset.path / ref.shard)
+        yield np.diff(shard.array("data/time", shard.rows()[ref.position]))

@@ -35,6 +35,11 @@ class ArraySpec:
         """Whether a row is a step rather than an episode."""
         return self.path.startswith("data/")
 
+    @property
+    def is_picture(self) -> bool:
+        """Whether a row is a picture."""
+        return self.dims[1:3] == ("v", "u")
+
 
 def _row(value: object, dtype: str) -> np.ndarray:
     return np.asarray(value, dtype)[None]

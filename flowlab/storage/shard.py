@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import zarr
+from jaxtyping import Int
 from pydantic import ValidationError
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
@@ -21,11 +22,14 @@ from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
 from flowlab.storage.schema import EPISODE_ENDS, POSES, QUALITY, SCHEMA, SCHEMA_VERSION, SIGHT, ArraySpec
 from flowlab.storage.shard_files import open_files, write_zip
 from flowlab.storage.stored_array import StoredArray, stored_array
-from flowlab.text import shown
+from flowlab.text import counted, shown
 from flowlab.untrusted import parse_json
 
 STEPS_PER_CHUNK = 256
 """A chunk holds at most this many rows; most episodes are one chunk per array."""
+PICTURES_PER_CHUNK_BYTES = 1 << 20
+"""A chunk of pictures holds no more than this, but one picture at least, so that a single one is read quickly. Smaller
+chunks would take more room: pictures of a scene that hardly changes are compressed together."""
 
 
 def write_shard(path: Path, episodes: Sequence[Episode], settings_digest: str) -> None:
@@ -106,6 +110,20 @@ class Shard:
         except DataError as error:
             raise DataError(f"{error}; {REPAIR}") from error
 
+    def stored(self, spec_path: str) -> StoredArray:
+        """An array, its values unread."""
+        try:
+            return stored_array(self._files, spec_path)
+        except DataError as error:
+            raise DataError(f"{error}; {REPAIR}") from error
+
+    def take(self, array: StoredArray, rows: Int[np.ndarray, "T"]) -> np.ndarray:
+        """Some rows of an array, in any order: no other chunks are read than theirs."""
+        try:
+            return array.take(self._files, rows)
+        except DataError as error:
+            raise DataError(f"{error}; {REPAIR}") from error
+
     def has(self, spec: ArraySpec) -> bool:
         """Whether the shard holds an array."""
         return f"{spec.path}/zarr.json" in self._files
@@ -127,7 +145,9 @@ class Shard:
         """The rows of each episode in the ``data`` arrays."""
         ends = self.array(EPISODE_ENDS).tolist()
         if len(ends) != len(self) or sorted({0, *ends}) != [0, *ends]:
-            raise DataError(f"{self.path}/{EPISODE_ENDS}: damaged ({shown(ends)} for {len(self)} episodes); {REPAIR}")
+            raise DataError(
+                f"{self.path}/{EPISODE_ENDS}: damaged ({shown(ends)} for {counted(len(self), 'episode')}); {REPAIR}"
+            )
         return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
     def episodes(self) -> Iterator[Episode]:
@@ -230,10 +250,11 @@ def _encode(episodes: Sequence[Episode], settings_digest: str) -> dict[str, byte
 
 
 def _write(group: zarr.Group, path: str, values: np.ndarray, dims: tuple[str, ...], unit: str, meaning: str) -> None:
+    most = max(1, PICTURES_PER_CHUNK_BYTES // values[:1].nbytes) if "u" in dims and values.size else STEPS_PER_CHUNK
     group.create_array(
         path,
         data=values,
-        chunks=(max(1, min(len(values), STEPS_PER_CHUNK)), *(max(1, n) for n in values.shape[1:])),
+        chunks=(max(1, min(len(values), STEPS_PER_CHUNK, most)), *(max(1, n) for n in values.shape[1:])),
         compressors=[ZstdCodec(level=1), Crc32cCodec()],
         dimension_names=dims,
         attributes={"unit": unit, "meaning": meaning},

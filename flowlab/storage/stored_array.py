@@ -12,6 +12,7 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
+from jaxtyping import Int
 from numcodecs.zstd import decompress
 
 from flowlab.errors import DataError, first_line
@@ -65,13 +66,25 @@ class StoredArray:
         self._check_size(place, stored)
         values = np.empty((stop - start, *self.shape[1:]), self.dtype)
         for k, content in stored.items():
-            try:
-                chunk = self._decode(content)
-            except (ValueError, RuntimeError, TypeError) as error:
-                raise DataError(f"{place}: damaged ({first_line(error)})") from error
+            chunk = self._decode(place, content)
             first, last = max(start, k * size), min(stop, (k + 1) * size)
             values[first - start : last - start] = chunk[first - k * size : last - k * size]
         return values[0] if isinstance(rows, int) else values
+
+    def take(self, files: ShardFiles, rows: Int[np.ndarray, "T"]) -> np.ndarray:
+        """Some of its rows, in any order; no more chunks are in memory than one at a time.
+
+        Raises:
+            DataError: A chunk is missing or damaged.
+        """
+        place = f"{files.path}/{self.path}"
+        chunk_of, inside = np.divmod(rows, self.rows_per_chunk)
+        values = np.empty((len(rows), *self.shape[1:]), self.dtype)
+        for k in np.unique(chunk_of):
+            stored = {0: files.read(self._chunk(int(k)))}
+            self._check_size(place, stored)
+            values[chunk_of == k] = self._decode(place, stored[0])[inside[chunk_of == k]]
+        return values
 
     def _chunk(self, k: int) -> str:
         return "/".join([self.path, "c", str(k), *("0" for _ in self.shape[1:])])
@@ -82,8 +95,14 @@ class StoredArray:
         if claimed > max(_ALWAYS_BYTES, _MOST_COMPRESSED * sum(map(len, stored.values()))):
             raise DataError(f"{place}: damaged (it claims {claimed:,} bytes, far more than what is stored can hold)")
 
-    def _decode(self, content: bytes) -> np.ndarray:
-        """The values of a chunk."""
+    def _decode(self, place: str, content: bytes) -> np.ndarray:
+        """The values of a chunk. Raises :class:`DataError` where it is damaged."""
+        try:
+            return self._unpacked(content)
+        except (ValueError, RuntimeError, TypeError) as error:
+            raise DataError(f"{place}: damaged ({first_line(error)})") from error
+
+    def _unpacked(self, content: bytes) -> np.ndarray:
         payload, checksum = content[:-_CHECKSUM], content[-_CHECKSUM:]
         if google_crc32c.value(payload).to_bytes(_CHECKSUM, "little") != checksum:
             raise ValueError("a checksum does not match")

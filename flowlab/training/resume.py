@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from flowlab.data.mixture import describe_mixture
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
@@ -50,7 +51,7 @@ def resume_run(
             raise DataError(
                 f"{folder}: its dataset is no longer at {place}; restore it, or change '{name}' in {folder / RUN}"
             )
-    source = open_training_source(*config.datasets)
+    source = open_training_source(*config.datasets, known=True)
     check_observer(trained, folder, source)
     if source.fingerprint != trained.fingerprint:
         raise DataError(
@@ -59,6 +60,10 @@ def resume_run(
         )
     step, groups = read_resume(folder)
     buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
+    if describe_mixture(source.parts, buffer, config.train, config.held_out, config.weights) != trained.mixture:
+        raise DataError(
+            f"{folder}: its {RUN} and {POLICY} tell of other datasets or weights; restore both from one run"
+        )
     policy = build_policy(
         trained.policy, groups.get("policy", {}), f"{folder}: its resume file does not fit its {POLICY}"
     )

@@ -14,9 +14,10 @@ from pydantic import PositiveInt
 
 from flowlab.config import Settings
 from flowlab.data.channels import infer_channels
+from flowlab.data.mixture import check_drawn, check_weights, describe_mixture
 from flowlab.data.normalizer import fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
-from flowlab.data.source import TrainingSource, open_training_source
+from flowlab.data.source import TrainingSource, open_training_source, warn_of_shared_scenes
 from flowlab.data.split import split_episodes
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError, UsageError
@@ -66,6 +67,7 @@ def begin_run(
     *,
     overfit: int | None = None,
     began_from: Path | None = None,
+    weights: Sequence[float] | None = None,
 ) -> Trainer:
     """A new run; or, where the same call began it earlier, that run, as it was after the last step that was saved.
 
@@ -73,8 +75,8 @@ def begin_run(
     :class:`UsageError` that shows the difference.
     """
     if not has_begun(out):
-        return prepare_run(data, out, settings, compute, overfit=overfit, began_from=began_from)
-    _check_same(out, settings, overfit, began_from)
+        return prepare_run(data, out, settings, compute, overfit=overfit, began_from=began_from, weights=weights)
+    _check_same(out, settings, overfit, began_from, weights)
     device = None if compute.device == "auto" else compute.device
     precision = None if compute.precision == "auto" else compute.precision
     data = (data,) if isinstance(data, Path) else data
@@ -89,6 +91,7 @@ def prepare_run(
     *,
     overfit: int | None = None,
     began_from: Path | None = None,
+    weights: Sequence[float] | None = None,
 ) -> Trainer:
     """A new run, ready to :func:`run`.
 
@@ -99,6 +102,8 @@ def prepare_run(
         compute: What it computes on.
         overfit: Train on so many demonstrations, the first ones, and validate on the same.
         began_from: A run, or one of its checkpoints, that the first weights are taken from.
+        weights: Of several datasets, how much of all windows each has, relative to the others; None draws all windows
+            alike.
 
     Raises:
         DataError, UsageError: Settings, data or weights do not fit each other; then nothing is written but the decoded
@@ -107,15 +112,23 @@ def prepare_run(
     check_loggers(compute.logs)
     processes = ProcessGroup(compute.device, compute.threads, compute.precision)
     processes.part(settings.batch.windows)
-    source = open_training_source(*((data,) if isinstance(data, Path) else data))
+    places = (data,) if isinstance(data, Path) else data
+    weighed = check_weights(weights, len(places))
+    source = open_training_source(*places)
+    warn_of_shared_scenes(source.parts)
     buffer = load_buffer(source, out, settings.needs.pictures)
     train, held_out = split_episodes(buffer.episodes, settings.data, buffer.inferred)
     if overfit is not None:
         train = held_out = list(range(min(overfit, len(buffer.episodes))))
+    if not train:
+        raise DataError(
+            f"{source.path}: nothing is left to train on beside what is held out; add --set data.held_out=0"
+        )
+    mixture = describe_mixture(source.parts, buffer, train, held_out, weighed)
     policy = _new_policy(source, buffer, settings, began_from)
     planned = RunConfig(
         dataset=source.path.resolve(),
-        more_datasets=tuple(path.resolve() for path in source.more),
+        more_datasets=tuple(path.resolve() for path in source.paths[1:]),
         steps=_epochs_to_steps(buffer, train, settings),
         train=tuple(train),
         held_out=tuple(held_out),
@@ -126,20 +139,28 @@ def prepare_run(
         logs=compute.logs,
         began_from=None if began_from is None else str(began_from),
         overfit=overfit,
+        weights=weighed,
     )
     if settings.run.minutes is not None and settings.run.steps is None:
         steps = _fitting_steps(Trainer(out, planned, copy.deepcopy(policy), buffer, processes), settings.run.minutes)
         planned = planned.model_copy(update={"steps": processes.broadcast(steps)})
+    check_drawn(source.parts, weighed, settings, planned.steps)
     trainer = Trainer(out, planned, policy, buffer, processes)
-    trainer.begin(TrainedPolicy.now(policy.spec, source, buffer))
+    trainer.begin(TrainedPolicy.now(policy.spec, source, buffer, mixture))
     return trainer
 
 
-def _check_same(out: Path, settings: TrainSettings, overfit: int | None, began_from: Path | None) -> None:
+def _check_same(
+    out: Path,
+    settings: TrainSettings,
+    overfit: int | None,
+    began_from: Path | None,
+    weights: Sequence[float] | None,
+) -> None:
     """Raises :class:`UsageError` where the run of a folder was begun in another way."""
     began, trained = read_run_config(out), read_trained(out)
-    asked = {"overfit": overfit, "from": began_from and str(began_from)}
-    found = {"overfit": began.overfit, "from": began.began_from}
+    asked = {"overfit": overfit, "from": began_from and str(began_from), "weights": [*weights] if weights else None}
+    found = {"overfit": began.overfit, "from": began.began_from, "weights": [*began.weights] or None}
     old, new = (json.loads(s.model_dump_json()) for s in (trained.policy.settings, settings))
     owners = ("the run", "this command")
     if lines := [*differences(found, asked, "run", owners=owners), *differences(old, new, "settings", owners=owners)]:

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from flowlab.arguments import check_count, check_minutes, check_names, check_optional_count, check_path, check_settings
+from flowlab.data.mixture import check_weights, dataset_shares
 from flowlab.data.source import paths_of
 from flowlab.hub.pulling import local_sources
-from flowlab.policies.checkpoint import writing_run
+from flowlab.policies.checkpoint import read_trained, writing_run
 from flowlab.policies.profiles import load_settings
 from flowlab.storage.dataset import Dataset
+from flowlab.text import counted
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import last_metrics
 from flowlab.training.precision import Precision
@@ -96,6 +98,7 @@ def train(
     seed: int | None = None,
     overfit: int | None = None,
     began_from: Path | str | None = None,
+    weights: Sequence[float | int] | None = None,
     device: str = "auto",
     threads: int = 1,
     precision: Precision = "auto",
@@ -119,6 +122,8 @@ def train(
         seed: Short for the setting ``run.seed``.
         overfit: Train on so many demonstrations, the first ones, and validate on the same.
         began_from: A run, or one of its checkpoints, that the first weights are taken from.
+        weights: Of several datasets, how much of all windows each has, relative to the others: ``[0.7, 0.3]`` or
+            ``[7, 3]``; None draws all windows alike, so that larger datasets have more of them.
         device: ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` is a GPU where there is one.
         threads: CPU threads of each process.
         precision: ``fp32`` or ``bf16``; ``auto`` is bf16 where the device has units for it.
@@ -143,8 +148,11 @@ def train(
     check_loggers(tuple(logs), here)
     compute = ComputeSettings(device=device, threads=threads, precision=precision, logs=tuple(logs))
     began = None if began_from is None else check_path(began_from, "began_from")
+    weighed = check_weights(weights, len(data) if isinstance(data, list | tuple) else 1) or None
     sources = paths_of(local_sources(data, watch.on_start))
-    trainer = begin_run(sources, check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began)
+    trainer = begin_run(
+        sources, check_path(out, "out"), chosen, compute, overfit=overfit, began_from=began, weights=weighed
+    )
     return _run(trainer, watch)
 
 
@@ -212,13 +220,15 @@ def _describe(trainer: Trainer) -> Iterator[str]:
     """What was found and what will be done, before it takes long."""
     spec, planned = trainer.policy.spec, trainer.run
     inferred = len(set(planned.train) & set(planned.inferred))
-    taught = f"{len(planned.train)} demonstrations" + (f" ({inferred} with inferred actions)" if inferred else "")
+    taught = counted(len(planned.train), "demonstration") + (f" ({inferred} with inferred actions)" if inferred else "")
     millions = sum(p.numel() for p in trainer.policy.parameters()) / 1e6
     yield (
         f"{spec.settings.policy}, {millions:.1f} M weights, {planned.steps - trainer.step:,} steps on "
         f"{taught} of {', '.join(spec.tasks)}; {len(planned.held_out)} held out; "
         f"{trainer.processes.description}"
     )
+    trained = read_trained(trainer.folder)
+    yield from map(str, dataset_shares(trained.mixture, trained.dataset))
     if set(planned.held_out) & set(planned.inferred):
         yield (
             "actions of what is held out were inferred, too: held-out errors are against these, not against what a "

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.mixture import make_sampler
 from flowlab.data.replay_buffer import ReplayBuffer
-from flowlab.data.window_sampler import WindowSampler, index_windows
+from flowlab.data.window_sampler import index_windows
 from flowlab.errors import DataError, FlowlabError
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicyNetwork
@@ -57,8 +58,7 @@ class Trainer:
         self.optimizers = Optimizers(policy, settings.optimizer, run.steps)
         self._network = processes.wrap(policy)
         self._builder = BatchBuilder(buffer, policy.spec.channels, settings, policy.spec.tasks)
-        windows = index_windows(buffer, list(run.train), settings.n_action_steps)
-        self._sampler = WindowSampler(windows, settings.batch.windows, settings.batch.segment, settings.run.seed)
+        self._sampler = make_sampler(buffer, list(run.train), run.weights, settings)
         self._held_out = index_windows(buffer, list(run.held_out), settings.n_action_steps) if run.held_out else None
         self._means = RunningMeans()
         self.step = 0

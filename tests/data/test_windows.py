@@ -1,6 +1,7 @@
 """Windows for anybody's own training hold what the episodes say, whoever reads them."""
 
 import pickle
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,19 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic import make_dataset, make_episode, with_quality
+from synthetic import LOOKING_DOWN, assert_same, make_dataset, make_episode, make_provenance, with_quality
 from thoroughness import examples
 from torch.utils.data import DataLoader
 
 import flowlab
-from flowlab.data import Windows
+from flowlab.data import Windows, window_pictures
 from flowlab.errors import DataError, FlowlabError, UsageError
+from flowlab.geometry.camera import Camera
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.dp3 import DP3Exporter
+from flowlab.storage.shard import PICTURES_PER_CHUNK_BYTES, Shard
+from flowlab.storage.shard_files import ZippedFiles, write_zip
 
 LENGTHS = (9, 14, 6)
 
@@ -227,10 +231,115 @@ def test_what_is_wrong_is_one_sentence(case: str, data: Path) -> None:
         Windows(data, **given)
 
 
-def test_pictures_that_are_not_there_are_no_key(tmp_path: Path) -> None:
-    make_dataset(tmp_path / "d", [[make_episode(0)]])
-    with pytest.raises(UsageError, match="no array is called 'rgb'"):
-        Windows(tmp_path / "d", {"rgb": [0]})
+@pytest.mark.parametrize(
+    ("kind", "name", "advice"),
+    [
+        ("simulated", "rgb", "extract-sim --set expert.scene.rgb=true --set expert.scene.renderer=gl"),
+        ("simulated", "depth", "extract-sim --set write.depth=true"),
+        ("recorded", "rgb", "track-real --set write.rgb=true"),
+        ("recorded", "depth", "track-real --set write.depth=true"),
+        ("unknown", "rgb", "not among what it was made from"),
+    ],
+)
+def test_pictures_that_are_not_there_are_refused_with_how_to_get_some(
+    kind: str, name: str, advice: str, tmp_path: Path
+) -> None:
+    make_dataset(tmp_path / "d", [[make_episode(0)]], provenance=make_provenance(kind=kind))
+    assert name not in Windows(tmp_path / "d", {"state": [0]}).keys
+    with pytest.raises(DataError, match=f"/d: holds no (color|depth) pictures.*{advice}"):
+        Windows(tmp_path / "d", {name: [0]})
+
+
+# Pictures that stay in the shards.
+
+
+def test_pictures_are_read_from_the_shards_and_nothing_is_decoded_of_others(
+    data: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows = Windows(data, {"rgb": [-1, 0], "depth": [0]})
+    decoded = Windows(data, {"rgb": [-1, 0], "depth": [0]}, pictures="decoded")
+    assert set(decoded.keys) == set(windows.keys)
+    for k in range(len(windows)):
+        for key, value in windows[k].items():
+            assert torch.equal(value, decoded[k][key]) if isinstance(value, torch.Tensor) else value == decoded[k][key]
+    windows = Windows(data, {"rgb": [-1, 0]})  # of which no shard is open
+    read: list[str] = []
+    original = ZippedFiles.read
+    monkeypatch.setattr(ZippedFiles, "read", lambda self, name: read.append(name) or original(self, name))
+    windows[3]
+    chunks = [name for name in read if "/c/" in name and name.startswith("data")]
+    assert chunks == ["data/rgb/c/0/0/0/0"]
+
+
+def test_a_single_picture_is_a_small_part_of_what_lies_in_a_shard(tmp_path: Path) -> None:
+    tall = PICTURES_PER_CHUNK_BYTES // (64 * 3) // 2  # of which two fit into a chunk
+    rng = np.random.default_rng(0)
+    e = make_episode(0, steps=7, points=4, queries=2)
+    rgb, depth = rng.integers(0, 256, (7, tall, 64, 3), np.uint8), rng.random((7, tall, 64), np.float32)
+    e = replace(e, rgb=rgb, depth=depth, camera=Camera.from_fovy(64, tall, 45.0, LOOKING_DOWN))
+    make_dataset(tmp_path / "d", [[e]])
+    stored = {a.path: a.rows_per_chunk for a in Shard(next((tmp_path / "d/shards").iterdir())).describe()}
+    assert (stored["data/rgb"], stored["data/depth"], stored["data/tracks"]) == (2, 1, 7)
+    windows = Windows(tmp_path / "d", {"rgb": [-5, 0, 1], "depth": [0]})
+    np.testing.assert_array_equal(windows[5]["rgb"].mul(255).round().numpy(), np.moveaxis(rgb[[0, 5, 6]], -1, 1))
+    assert_same(Dataset(tmp_path / "d")[0], e)
+
+
+def test_what_earlier_versions_stored_together_is_decoded_first(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(window_pictures, "_QUICK_BYTES", 12 * 16 * 3 * 10)  # the longest episode has more rows
+    by_default, asked = (Windows(data, {"rgb": [0]}, pictures=where) for where in (None, "stored"))
+    assert torch.equal(by_default[2]["rgb"], asked[2]["rgb"])
+    assert (by_default._pictures.stored, asked._pictures.folders) == ({}, [])
+    with pytest.raises(UsageError, match="pictures must be 'stored', 'decoded' or None; found 'shards'"):
+        Windows(data, {"rgb": [0]}, pictures="shards")  # type: ignore[arg-type]
+
+
+def test_the_same_episodes_in_other_shards_have_their_own_pictures(
+    data: Path, episodes: list[Episode], tmp_path: Path
+) -> None:
+    """They have one fingerprint, and so what was decoded of one is used for the other."""
+    make_dataset(tmp_path / "d", [[e] for e in reversed(episodes)])
+    assert Dataset(tmp_path / "d").fingerprint == Dataset(data).fingerprint
+    first, second = (Windows(place, {"rgb": [0], "action": [0]}) for place in (data, tmp_path / "d"))
+    for k in range(len(first)):
+        assert torch.equal(first[k]["rgb"], second[k]["rgb"])
+        assert torch.equal(first[k]["action"], second[k]["action"])
+
+
+def test_workers_that_are_forked_read_through_files_of_their_own(data: Path, episodes: list[Episode]) -> None:
+    windows = Windows(data, {"rgb": [0]})
+    expected = [windows[k]["rgb"] for k in range(len(windows))]  # its shards are open when the workers begin
+    for _ in range(3):
+        loader = DataLoader(windows, batch_size=1, num_workers=3, multiprocessing_context="fork")
+        assert all(torch.equal(batch["rgb"][0], value) for batch, value in zip(loader, expected, strict=True))
+
+
+def test_pictures_of_some_episodes_or_of_other_sizes_are_refused(tmp_path: Path) -> None:
+    one, two = with_pictures(make_episode(0)), make_episode(1)
+    make_dataset(tmp_path / "some", [[one], [two]])
+    with pytest.raises(DataError, match="/some: roll seed 1: 'rgb' is in some episodes only; take those by"):
+        Windows(tmp_path / "some", {"rgb": [0]})
+    assert one.rgb is not None
+    camera = Camera.from_fovy(16, 6, 45.0, LOOKING_DOWN)
+    small = replace(one, seed=1, rgb=one.rgb[:, :6], depth=None, camera=camera)
+    make_dataset(tmp_path / "sizes", [[one], [small]])
+    with pytest.raises(DataError, match=r"roll seed 1: 'rgb' is \(6, 16, 3\), in those before \(12, 16, 3\)"):
+        Windows(tmp_path / "sizes", {"rgb": [0]})
+
+
+def test_damaged_pictures_are_one_sentence_and_never_black(tmp_path: Path) -> None:
+    make_dataset(tmp_path / "d", [[with_pictures(make_episode(0))]])
+    windows = Windows(tmp_path / "d", {"rgb": [0]})
+    shard = next((tmp_path / "d/shards").iterdir())
+    with zipfile.ZipFile(shard) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    chunk = bytearray(files["data/rgb/c/0/0/0/0"])
+    chunk[40] ^= 1
+    write_zip(shard, {**files, "data/rgb/c/0/0/0/0": bytes(chunk)})  # whose own checksum is right
+    with pytest.raises(DataError, match=r"data/rgb: damaged \(a checksum does not match\)"):
+        pickle.loads(pickle.dumps(windows))[0]
 
 
 @pytest.mark.parametrize("index", [slice(2, 4), "a", 1.5, [0, 1], None])
