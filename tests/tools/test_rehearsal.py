@@ -72,4 +72,4 @@ def test_a_small_rehearsal_ends_in_a_table_goes_on_and_keeps_to_its_settings(tmp
     assert "rehearsal.json: was begun with film" in said
     assert "choose another --out" in said
     code, said = rehearse(out, "--set", "senser=tof")
-    assert "unknown setting 'senser'" in said
+    assert "no setting is called 'senser'; did you mean sensor?" in said
