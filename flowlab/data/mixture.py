@@ -17,6 +17,8 @@ from flowlab.errors import DataError, UsageError
 from flowlab.text import counted
 
 Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, lt=1 << 62)]
+"""Of what a file says that there is."""
 
 
 class MixedDataset(Settings):
@@ -26,9 +28,9 @@ class MixedDataset(Settings):
     """Of its content."""
     weight: Weight
     """Relative to those of the others; what part of all windows it means, :func:`mixture_shares` tells."""
-    demonstrations: int
+    demonstrations: Count
     """So many of it were trained on."""
-    held_out: int
+    held_out: Count
     hub: Annotated[str, later("")] = ""
     """Where on the Hub it was pulled from, ``user/name@commit``; empty where it was not."""
 
@@ -103,6 +105,11 @@ def describe_mixture(
         )
         for k, part in enumerate(parts)
     )
+
+
+def without_names(mixture: Sequence[MixedDataset]) -> list[MixedDataset]:
+    """What counts of a mixture: the same content may be pulled from elsewhere, or not from the Hub."""
+    return [one.model_copy(update={"hub": ""}) for one in mixture]
 
 
 def check_drawn(parts: Sequence[SourcePart], weights: Sequence[float], settings: TrainSettings, steps: int) -> None:
