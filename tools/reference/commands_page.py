@@ -5,7 +5,7 @@ import textwrap
 from collections.abc import Iterator
 
 import click
-from markdown import one_line
+from as_markdown import as_code, one_line
 
 from flowlab.cli import cli
 
@@ -33,7 +33,7 @@ def _command(name: str, parent: click.Context) -> Iterator[str]:
     yield f"```text\n{context.command_path} {' '.join(command.collect_usage_pieces(context))}\n```\n"
     yield from _paragraphs(inspect.cleandoc(command.help or ""))
     records = [p.get_help_record(context) for p in command.params if isinstance(p, click.Option)]
-    if rows := [f"| `{one_line(r[0])}` | {one_line(r[1])} |" for r in records if r]:
+    if rows := [f"| {as_code(r[0])} | {one_line(r[1])} |" for r in records if r]:
         yield "\n".join(["| option | |", "|---|---|", *rows, ""])
     if isinstance(command, click.Group):
         for below in command.list_commands(context):

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 
 import yaml
 from field_docs import Setting, settings_of
-from markdown import one_line
+from as_markdown import one_line
 from pydantic import BaseModel
 
 from flowlab.actions.film_labeler import LabelActionsSettings
