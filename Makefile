@@ -5,7 +5,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 LONG := OMP_NUM_THREADS=1 nice -n 10 $(BIN)/flowlab bench --workers 1 --device cpu
 unexport PYTHONDONTWRITEBYTECODE # images set it; each of the hundreds of processes would compile all that it imports
 
-.PHONY: demo pictures test test-all openpi lerobot ray campaigns lint format house docs wheel benchmark table1 ablations clean help
+.PHONY: demo pictures test test-all openpi lerobot ray campaigns lint format house reference docs wheel benchmark table1 ablations clean help
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -56,6 +56,9 @@ format: .venv/lint ## format the code and mend what can be mended
 
 house: .venv/run ## figures of the code: lengths, circles, names, docstrings, spelling
 	$(BIN)/python tests/house/house.py
+
+reference: .venv/run ## write docs/commands.md and docs/settings.md, from the code
+	$(BIN)/python tools/reference
 
 docs: .venv/docs ## the documentation, into site/; warnings are errors
 	$(BIN)/zensical build --clean --strict

@@ -30,10 +30,13 @@ class ExperimentRecipe(Settings):
     """What is compared with what, and how long."""
 
     name: str
+    """What the experiment is called in its report."""
     description: str = ""
+    """What it is for, in a sentence."""
     tasks: tuple[str, ...] = Field(min_length=1)
     """Tasks or groups."""
     policies: tuple[str, ...] = Field(min_length=1)
+    """Names or import paths of what is trained."""
     demonstrations: PositiveInt
     """Trained on, of each task; one more is held out."""
     recipe: str
@@ -49,12 +52,15 @@ class ExperimentRecipe(Settings):
     set: tuple[str, ...] = ()
     """Settings of training for all, as for ``flowlab train --set``."""
     seeds: tuple[int, ...]
+    """Of evaluation: they decide which scenes policies meet."""
     episodes: PositiveInt
     """Of each seed."""
     curve_episodes: int = Field(ge=0)
     """Of the first seed, for every checkpoint but the last; 0 draws no learning curves."""
     variants: tuple[PolicyVariant, ...] = ()
+    """Policies with other settings, or on some of the tasks only."""
     device: str = "auto"
+    """Where policies are trained: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` is a GPU if there is one."""
     keep_runs: bool = True
     """Whether the training run of a finished unit is kept, which has some 100 MB; its result always is."""
 

@@ -23,7 +23,9 @@ class Recipe(Settings):
     """A pipeline, its tasks, and how many episodes of each."""
 
     name: str
+    """What the recipe is called in datasets made by it."""
     description: str = ""
+    """What it makes, in a sentence."""
     tasks: tuple[str, ...] = ()
     """Tasks or groups of tasks, where the command line names none."""
     episodes: int = Field(default=10, gt=0)

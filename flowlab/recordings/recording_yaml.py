@@ -50,11 +50,17 @@ class Topics(Settings):
     """Which topics of a ROS bag to read, where types and names do not tell."""
 
     color: str | None = None
+    """Color pictures."""
     depth: str | None = None
+    """Depth pictures."""
     color_info: str | None = None
+    """``CameraInfo`` of the color camera."""
     depth_info: str | None = None
+    """``CameraInfo`` of the depth camera."""
     state: str | None = None
+    """Numbers of the robot."""
     action: str | None = None
+    """What the robot was told to do."""
     T_world_cam: str | None = None
     """Poses of a camera that moves."""
 
