@@ -15,6 +15,8 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 _WORDS = {
+    ,
+}
     int: "whole number",
     float: "number",
     str: "text",
