@@ -15,8 +15,6 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 _WORDS = {
-    ,
-}
     int: "whole number",
     float: "number",
     str: "text",
