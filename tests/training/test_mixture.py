@@ -229,11 +229,11 @@ def test_a_weight_of_what_is_all_held_out_is_refused(tmp_path: Path, capsys: Cap
     command = ["train", *places, "--policy", "dp3", "--out", tmp_path / "run", *SMALL, "--weights", "1,1"]
     code, _, err = call_cli(capsys, *command)
     assert code == 3
-    assert f"{places[1]}: its weight is 1, and none of its 1 demonstrations is trained on (1 held out)" in err
+    assert f"{places[1]}: its weight is 1, and none of its demonstrations (1) is trained on (1 held out)" in err
     assert call_cli(capsys, *command, "--set", "data.held_out=0")[0] == 0
     command[command.index(tmp_path / "run")] = tmp_path / "overfit"
     code, _, err = call_cli(capsys, *command, "--overfit", "1")
-    assert (code, "its weight is 1, and none of its 1 demonstrations" in err) == (3, True)
+    assert (code, "its weight is 1, and none of its demonstrations (1)" in err) == (3, True)
 
 
 def _sped_up(e: Episode) -> Episode:
