@@ -505,7 +505,6 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "no time": (["--budget", "0m"], "--budget 0m: must be a time"),
     "time without end": (["--budget", "infh"], "--budget infh: must be a time"),
     "time that is none": (["--budget", "nanm"], "--budget nanm: must be a time"),
-    "seeds": (["--seeds", "a"], "--seeds a: must be whole numbers"),
 }
 
 

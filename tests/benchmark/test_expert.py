@@ -55,7 +55,7 @@ def test_the_expert_does_as_in_demonstrations_on_the_layouts_of_policies(
     """Episodes are added to those that are there, and none is tried twice."""
     ask: list[Any] = ["bench", "--recipe", recipe, "--out", tmp_path, "--expert", "--workers", "1"]
     code, out, _ = call_cli(capsys, *ask, "--dry-run")
-    assert (code, out.splitlines()) == (0, [f"{TASK}: 8 episodes", "1 tasks, 8 episodes of their experts left"])
+    assert (code, out.splitlines()) == (0, [f"{TASK}: 8 episodes", "1 task, 8 episodes of their experts left"])
     assert call_cli(capsys, *ask, "--episodes", "1")[0] == 0
     first = rows(tmp_path)
     assert call_cli(capsys, *ask)[0] == 0
