@@ -1,7 +1,7 @@
 """``make reference``: pages of every command and every setting, from the code itself.
 
-They are kept in the repository, so that they can be read there, and ``tests/docs/test_reference.py`` holds that they are
-what the code says.
+They are kept in the repository, so that they can be read there, and ``tests/docs/test_reference.py`` holds that they
+are what the code says.
 """
 
 from pathlib import Path

@@ -4,8 +4,8 @@ import inspect
 from collections.abc import Iterable, Iterator
 
 import yaml
-from field_docs import Setting, settings_of
 from as_markdown import one_line
+from field_docs import Setting, settings_of
 from pydantic import BaseModel
 
 from flowlab.actions.film_labeler import LabelActionsSettings
@@ -23,9 +23,9 @@ RECIPES = {"metaworld": "extract-sim", "metaworld-dp3": "extract-sim", "real": "
 _INTRO = """\
 # Every setting
 
-Each with its type, its default and its meaning, as the code has them; the page is made by `make reference`. A setting is changed by
-`--set KEY=VALUE`, once for each, where KEY is the heading's prefix and the name in the table, and VALUE is YAML: `--set
-observer.points=512`, `--set 'encoder.widths=[64, 128]'`. In files of your own ([recipes](stages.md),
+Each with its type, its default and its meaning, as the code has them; the page is made by `make reference`. A setting
+is changed by `--set KEY=VALUE`, once for each, where KEY is what the table shows and VALUE is YAML:
+`--set observer.points=512`, `--set 'encoder.widths=[64, 128]'`. In files of your own ([recipes](stages.md),
 [profiles](training.md)) the same names are keys. What is unknown or does not fit is refused, never ignored.
 """
 
@@ -75,7 +75,7 @@ def _others() -> Iterator[str]:
         yield _section("", EXPORTERS.load(name), title=name)
     yield "## Files that you write\n"
     yield _section("", Metadata, "See [recordings](recordings.md).", title="recording.yaml")
-    yield _section("", Recipe, "See [recipes and stages](stages.md).", title="A recipe of a dataset", without={"stages"})
+    yield _section("", Recipe, "See [stages](stages.md).", title="A recipe of a dataset", without=["stages"])
     yield _section("", ExperimentRecipe, "See [experiments](evaluating.md).", title="A recipe of an experiment")
     yield _section("", PolicyVariant, title="One of its variants")
 
