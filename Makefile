@@ -5,7 +5,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 LONG := OMP_NUM_THREADS=1 nice -n 10 $(BIN)/flowlab bench --workers 1 --device cpu
 unexport PYTHONDONTWRITEBYTECODE # images set it; each of the hundreds of processes would compile all that it imports
 
-.PHONY: demo test test-all openpi lerobot ray campaigns lint format house reference docs wheel benchmark table1 ablations clean help
+.PHONY: demo pictures test test-all openpi lerobot ray campaigns lint format house reference docs wheel benchmark table1 ablations clean help
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -13,6 +13,9 @@ help: ## this list
 demo: .venv/run .venv/opengl ## a policy from nothing in minutes, and labels from pictures alone: demo/index.html
 	rm -rf demo
 	$(BIN)/python tools/demo
+
+pictures: .venv/run .venv/opengl ## every picture of the documentation, anew; NAMES="hammer film" for these only
+	$(BIN)/python tools/pictures $(NAMES)
 
 test: .venv/test ## the tests, below 8 minutes on 2 cores
 	$(BIN)/pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
@@ -77,7 +80,7 @@ ablations: .venv/run ## the paper's Tables II and III and its learning curves, l
 	$(LONG) --recipe ablations --out docs/results/ablations
 
 clean: ## remove environments and everything made by the targets above
-	rm -rf .venv .venv-lerobot .venv-openpi .venv-wheel demo dist site
+	rm -rf .venv .venv-lerobot .venv-openpi .venv-wheel demo pictures dist site
 
 .venv/run: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -5,13 +5,17 @@ The command line has its own checks of what is typed; these are the same limits 
 
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
 from flowlab.errors import UsageError
+from flowlab.text import cut
 
+_RANGE = re.compile(r"\s*(-?\d{0,18})\s*(:?)\s*(-?\d{0,18})\s*", re.ASCII)
+_MOST_NUMBERS = 10_000_000
 SETTINGS_FORM = "a list of strings, as in settings=['observer.points=512']"
 
 
@@ -106,6 +110,48 @@ def check_minutes(value: Any, name: str = "minutes") -> float | None:
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < math.inf:
         raise _wrong(name, value, "a number above 0, or None")
     return float(value)
+
+
+def parse_numbers(text: str, name: str, count: int | None = None) -> list[int]:
+    """Whole numbers of a list with commas: numbers, and ranges as in a slice, whose end is not in it.
+
+    Where it is told how many there are, a range may lack an end, and negative numbers count from there. Raises
+    :class:`UsageError` for anything else, and for what is beyond ``count``.
+    """
+    found: list[int] = []
+    for part in text.split(","):
+        found += _range(part, name, count)
+        if len(found) > _MOST_NUMBERS:
+            raise UsageError(f"{name}: {cut(part)} is more than {_MOST_NUMBERS:,} numbers")
+    return found
+
+
+def _range(text: str, name: str, count: int | None) -> range:
+    """The numbers that ``3``, ``0:50``, ``50:`` or ``-10:`` mean."""
+    match = _RANGE.fullmatch(text)
+    first, colon, last = match.groups() if match else ("", "", "")
+    endless = count is None and (first.startswith("-") or bool(colon and not last) or last.startswith("-"))
+    if (not colon and not first) or "-" in (first, last) or (last and not colon) or endless:
+        raise UsageError(f"{name}: found {cut(repr(text))}, expected numbers or ranges from 0, as in 0:50,70")
+    start = position(int(first), count, name) if first else 0
+    if not colon:
+        return range(start, start + 1)
+    end = int(last) if last else count or 0
+    stop = end + (count or 0) if end < 0 else end
+    if stop <= start or (count is not None and stop > count):
+        beyond = "" if count is None else f" or ends beyond the {count} that there are, counted from 0"
+        raise UsageError(f"{name}: {cut(text)} is empty{beyond}")
+    return range(start, min(stop, start + _MOST_NUMBERS + 1))
+
+
+def position(number: int, count: int | None, name: str) -> int:
+    """A position among ``count``, from 0, where -1 is the last. Raises :class:`UsageError` where there is none."""
+    if count is None:
+        return number
+    if not -count <= number < count:
+        one = name.removesuffix("s")
+        raise UsageError(f"{name}: there is no {one} {number}; there are {count} to choose from, counted from 0")
+    return number % count
 
 
 def _listed(value: Any, kind: Any) -> tuple[Any, ...] | None:

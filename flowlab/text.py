@@ -37,6 +37,11 @@ def one_line(text: str) -> str:
     return printable(text).replace("\n", " ")
 
 
+def counted(number: int, one: str, many: str = "") -> str:
+    """How many there are of something, as people say it: 1 episode, 2,000 episodes."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
 def markdown(text: str) -> str:
     """Text from a file as Markdown shows it, in a table too: none of it is markup."""
     return _MARKUP.sub(r"\\\g<0>", one_line(text))

@@ -18,7 +18,7 @@ from flowlab.provenance import Channels
 from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import differences
-from flowlab.text import cut
+from flowlab.text import counted, cut
 
 _LEAST_DEMONSTRATIONS = 2
 
@@ -47,7 +47,8 @@ def fitting_problem(films: Dataset, labeled: Dataset) -> str:
         if count[task] < _LEAST_DEMONSTRATIONS:
             there = cut(", ".join(f"{n} of '{t}'" for t, n in sorted(count.items())))
             return (
-                f"{labeled.path}: has {count[task]} demonstrations of '{task}', of which there are films; at least "
+                f"{labeled.path}: has {counted(count[task], 'demonstration')} of '{task}', of which "
+                f"there are films; at least "
                 f"{_LEAST_DEMONSTRATIONS} are needed, since how far off inferred actions are is measured on one that "
                 f"is left out; it has {there}"
             )

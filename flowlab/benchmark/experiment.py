@@ -1,6 +1,7 @@
 """Run a whole experiment: datasets, policies, their evaluations; unit by unit, each done once."""
 
 import json
+import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -24,8 +25,10 @@ from flowlab.policies.checkpoint import newest_checkpoint, read_trained, step_of
 from flowlab.policies.run_folder import read_resume, read_run_config
 from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
+from flowlab.text import counted
 from flowlab.training import run
 
+_LOG = logging.getLogger(__name__)
 RUNS = "runs"
 """Folder of an experiment that holds its training runs; of a finished unit, none is needed any more."""
 StartUnits = StartEngine[ExperimentUnit, str]
@@ -123,13 +126,20 @@ def _run_units(
             known[ended.receipt] = read_result(unit_path(out, ended.receipt))
             on_result(known[ended.receipt])
     if failures:
-        raise UnfinishedError(f"{len(failures)} units failed, the first {failures[0]}; the same command tries again")
+        raise UnfinishedError(
+            f"{counted(len(failures), 'unit')} failed, the first {failures[0]}; the same command tries again"
+        )
 
 
 def _discard_run(recipe: ExperimentRecipe, out: Path, name: str) -> None:
-    """Delete the run of a unit that is done, where the recipe keeps none."""
-    if not recipe.keep_runs and (folder := out / RUNS / name).is_dir():
-        shutil.rmtree(folder)
+    """Delete the run of a unit that is done, where the recipe keeps none; not what somebody linked to."""
+    folder = out / RUNS / name
+    if recipe.keep_runs or not folder.is_dir():
+        return
+    if folder.is_symlink():
+        _LOG.warning("flowlab: %s: is a link, so the run it leads to stays; delete it if you need it no more", folder)
+        return
+    shutil.rmtree(folder)
 
 
 def _train(data: Path, folder: Path, settings: TrainSettings, device: str) -> None:
@@ -181,7 +191,8 @@ def _known_result(out: Path, unit: ExperimentUnit, recipe: ExperimentRecipe) -> 
     if _finished(out / RUNS / unit.name):
         return None  # what is missing can be tried still
     raise DataError(
-        f"{path}: has {len(last)} episodes, and other ones than the recipe's ({recipe.episodes} of each of the seeds "
+        f"{path}: has {counted(len(last), 'episode')}, and other ones than the recipe's "
+        f"({recipe.episodes} of each of the seeds "
         f"{', '.join(map(str, recipe.seeds))}, {recipe.curve_episodes} at earlier checkpoints), and the run that could "
         f"try them is gone; ask for those that it has, choose another --out, or delete it to make it anew"
     )

@@ -15,6 +15,7 @@ from flowlab.evaluation.expert_rollout import roll_out_expert
 from flowlab.evaluation.trials import Trial
 from flowlab.files import locked
 from flowlab.pipeline.units import JobShard
+from flowlab.text import counted
 
 _SIMULATOR = ("metaworld", "mujoco")
 
@@ -64,7 +65,9 @@ def run_experts(
                 else:
                     on_result(read_expert(expert_path(out, ended.receipt)))
     if failures:
-        raise UnfinishedError(f"{len(failures)} tasks failed, the first {failures[0]}; the same command tries again")
+        raise UnfinishedError(
+            f"{counted(len(failures), 'task')} failed, the first {failures[0]}; the same command tries again"
+        )
     paths = [expert_path(out, task) for task in expand_tasks(recipe.tasks)]
     return [read_expert(path) for path in paths if path.exists()]
 

@@ -12,6 +12,7 @@ from flowlab.errors import UsageError, unknown_name
 from flowlab.pipeline.units import JobShard
 from flowlab.policies.profiles import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
+from flowlab.text import counted
 
 DATA = "data"
 """Folder of an experiment that holds its datasets."""
@@ -50,13 +51,14 @@ def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
 
 def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) -> str:
     """A sentence on how long training will take; where only its steps are known, on how many there are."""
+    policies = counted(units, "policy", "policies")
     if recipe.minutes is None:
-        episodes = len(set(recipe.seeds)) * recipe.episodes
-        return f"{units} policies, {recipe.steps} steps of training and {episodes} episodes each"
+        tried = counted(len(set(recipe.seeds)) * recipe.episodes, "episode")
+        return f"{policies}, {recipe.steps} steps of training and {tried} each"
     workers = workers or core_count()
     hours = units * recipe.minutes / 60
     return (
-        f"{units} policies, {recipe.minutes:g} minutes of training each: {hours:.1f} hours of one core, "
+        f"{policies}, {recipe.minutes:g} minutes of training each: {hours:.1f} hours of one core, "
         f"{hours / workers:.1f} on {workers}"
     )
 

@@ -52,6 +52,14 @@ class _Commands(click.Group):
         command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command that was asked for, which is never silent for long."""
+        from flowlab.cli.console import show
+        from flowlab.cli.heartbeat import beating
+
+        with beating(ctx, show):
+            return super().invoke(ctx)
+
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:

@@ -6,10 +6,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import echo, print_json, print_tables, say
-from flowlab.cli.evaluate import echo_report, parse_seeds
+from flowlab.cli.console import echo, json_option, print_json, print_tables, quiet_option, say, warn
+from flowlab.cli.evaluate import echo_report
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import (
+    PluginName,
+    installed,
+    names_option,
+    numbers_option,
+    tasks_and_groups,
+)
+from flowlab.cli.values import groups as group_names
 from flowlab.errors import UsageError
+from flowlab.registry import ENGINES, POLICIES
+from flowlab.text import counted
 
 if TYPE_CHECKING:
     from flowlab.benchmark.expert_results import ExpertResult
@@ -21,30 +31,37 @@ if TYPE_CHECKING:
 @click.command()
 @click.option("--out", type=PATH, required=True, help="Folder of the experiment.")
 @click.option("--recipe", default="paper", show_default=True, help="An experiment's name, or a YAML file.")
-@click.option("--group", "groups", multiple=True, help="All tasks of a difficulty, instead of the recipe's tasks.")
-@click.option("--task", "tasks", multiple=True, help="A task, instead of the recipe's; may be repeated.")
-@click.option("--policies", metavar="NAME,...", help="'flowlab plugins' lists policies  [the recipe's].")
-@click.option("--variants", metavar="NAME,...", help="Of the recipe's variants; none for no variants  [all].")
+@names_option("--group", "groups", known=group_names, help="All tasks of a difficulty, instead of the recipe's.")
+@names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="Tasks, instead of the recipe's.")
+@names_option("--policies", known=installed(POLICIES), help="'flowlab plugins' lists policies  [the recipe's].")
+@names_option("--variants", help="Of the recipe's variants; none for no variants  [all].")
 @click.option("--budget", metavar="TIME", help="Training of each policy, as 10m, 90s or 1.5h  [the recipe's].")
 @click.option("--episodes", type=click.IntRange(min=1), help="Of each seed  [the recipe's].")
-@click.option("--seeds", metavar="N,...", help="Evaluation seeds  [the recipe's].")
-@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
+@numbers_option("--seeds", help="Evaluation seeds  [the recipe's].")
+@click.option(
+    "--engine",
+    type=PluginName(ENGINES),
+    default="local",
+    show_default=True,
+    help="Where it is done; 'flowlab plugins' lists engines.",
+)
 @click.option("--workers", type=click.IntRange(min=1), help="Policies trained at a time  [one for each core].")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0) of the tasks, for job arrays.")
 @click.option("--device", help="Where to train: cpu, cuda  [a GPU if there is one].")
 @click.option("--expert", is_flag=True, help="Let MetaWorld's own expert try the same episodes, instead of policies.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done; do nothing.")
-@click.option("--json", "as_json", is_flag=True, help="Print the results as JSON, and no progress.")
+@quiet_option
+@json_option
 def bench(
     out: Path,
     recipe: str,
     groups: tuple[str, ...],
     tasks: tuple[str, ...],
-    policies: str | None,
-    variants: str | None,
+    policies: tuple[str, ...],
+    variants: tuple[str, ...],
     budget: str | None,
     episodes: int | None,
-    seeds: str | None,
+    seeds: tuple[int, ...],
     engine: str,
     workers: int | None,
     shard: str,
@@ -81,9 +98,9 @@ def bench(
 
     changes: dict[str, Any] = {
         "tasks": (*groups, *tasks) or None,
-        "policies": tuple(_names(policies)) if policies else None,
+        "policies": policies or None,
         "episodes": episodes,
-        "seeds": parse_seeds(seeds) if seeds else None,
+        "seeds": seeds or None,
         "device": device,
     }
     changes = {k: v for k, v in changes.items() if v is not None}
@@ -91,19 +108,20 @@ def bench(
         changes |= {"minutes": _minutes(budget), "steps": None}
     part = JobShard.parse(shard)
     asked = load_experiment(recipe, **changes)
-    if variants is not None:
-        asked = with_variants(asked, [] if variants == "none" else _names(variants))
+    if variants:
+        asked = with_variants(asked, [name for name in variants if name != "none"])
     if expert:
         _check_trains_nothing(policies=policies, variants=variants, budget=budget, device=device)
         _run_experts(asked, out, engine, workers, part, dry_run, as_json)
         return
     if dry_run:
-        _say_what_is_left(asked, out, part, workers)
+        _say_what_is_left(asked, out, part, workers, as_json)
         return
-    progress = None if as_json else _print_progress
-    results = run_experiment(asked, out, engine=engine, workers=workers, shard=part, on_progress=progress)
+    results = run_experiment(asked, out, engine=engine, workers=workers, shard=part, on_progress=_print_progress)
     if not results:
-        say(f"nothing of this experiment is done yet, and nothing of it belongs to part {shard}")
+        warn(f"nothing of this experiment is done yet, and nothing of it belongs to part {shard}")
+        if as_json:
+            print_json([])
         return
     summary = summarize(results, experts=read_experts([out]), planned=plan_units(asked))
     write_report(out, summary, results)
@@ -114,7 +132,7 @@ def bench(
     echo_report(out)
 
 
-def _check_trains_nothing(**given: str | None) -> None:
+def _check_trains_nothing(**given: str | tuple[str, ...] | None) -> None:
     """Refuse options that are about policies, where none is trained."""
     if about_policies := [f"--{name}" for name, value in given.items() if value]:
         raise UsageError(f"--expert trains nothing, so leave out {', '.join(about_policies)}")
@@ -135,14 +153,17 @@ def _run_experts(
 
     if dry_run:
         left = missing_trials(recipe, out, shard)
-        for unit in left:
-            echo(f"{unit.name}: {len(unit.trials)} episodes")
-        echo(f"{len(left)} tasks, {sum(len(unit.trials) for unit in left)} episodes of their experts left")
+        trials = {unit.name: len(unit.trials) for unit in left}
+        if as_json:
+            print_json({"left": trials})
+            return
+        for name, count in trials.items():
+            echo(f"{name}: {counted(count, 'episode')}")
+        echo(f"{counted(len(left), 'task')}, {counted(sum(trials.values()), 'episode')} of their experts left")
         return
 
     def tell(result: "ExpertResult") -> None:
-        if not as_json:
-            say(f"{result.task}: {sum(o.success for o in result.outcomes)} of {len(result.outcomes)} solved")
+        say(f"{result.task}: {sum(o.success for o in result.outcomes)} of {len(result.outcomes)} solved")
 
     results = run_experts(recipe, out, engine=engine, workers=workers, shard=shard, on_result=tell)
     if as_json:
@@ -151,7 +172,9 @@ def _run_experts(
     print_tables([expert_table(results)])
 
 
-def _say_what_is_left(recipe: "ExperimentRecipe", out: Path, shard: "JobShard", workers: int | None) -> None:
+def _say_what_is_left(
+    recipe: "ExperimentRecipe", out: Path, shard: "JobShard", workers: int | None, as_json: bool
+) -> None:
     """Name the units that a run would do, and say what they cost and how many are done."""
     from flowlab.benchmark.experiment import known_results
     from flowlab.benchmark.units import plan_cost, plan_units, share_of_units
@@ -159,11 +182,15 @@ def _say_what_is_left(recipe: "ExperimentRecipe", out: Path, shard: "JobShard", 
     units = plan_units(recipe)
     known = known_results(recipe, units, out)
     left = [u for u in share_of_units(units, shard) if u.name not in known]
+    cost = plan_cost(recipe, len(left), workers)
+    if as_json:
+        print_json({"left": [unit.name for unit in left], "done": len(known), "units": len(units), "cost": cost})
+        return
     for unit in left:
         echo(unit.name)
     if known:
         echo(_standing(len(known), len(units)))
-    echo(plan_cost(recipe, len(left), workers))
+    echo(cost)
 
 
 def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> None:
@@ -176,12 +203,7 @@ def _print_progress(fresh: Sequence["PolicyResult"], done: int, total: int) -> N
 
 def _standing(done: int, total: int) -> str:
     """How far the whole experiment is."""
-    return f"{done} of {total} policies done" + (f", {total - done} left" if done < total else "")
-
-
-def _names(text: str) -> list[str]:
-    """The names of a list with commas."""
-    return [name for name in text.replace(" ", "").split(",") if name]
+    return f"{done} of {counted(total, 'policy', 'policies')} done" + (f", {total - done} left" if done < total else "")
 
 
 def _minutes(text: str) -> float:

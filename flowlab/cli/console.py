@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from flowlab.text import one_line
+from flowlab.cli.heartbeat import PULSE, be_quiet, is_quiet
+from flowlab.text import counted, one_line
 
 if TYPE_CHECKING:
     from flowlab.pipeline.scheduling import ExtractionProgress
@@ -30,8 +31,40 @@ def echo(*lines: str) -> None:
 
 
 def say(line: str) -> None:
-    """For people: a line of progress, on standard error."""
+    """For people: a line of progress, on standard error; nothing where quiet was asked for."""
+    if not is_quiet():
+        warn(line)
+
+
+def warn(line: str) -> None:
+    """For people: what is to be known of a result, on standard error, even where quiet was asked for."""
+    PULSE.said(line)
+    show(line)
+
+
+def show(line: str) -> None:
+    """A line on standard error."""
     _console.print(one_line(line), soft_wrap=True)
+
+
+def json_option(command: Any) -> Any:
+    """``--json``: what the command has to say is one JSON document on standard output. On an error there is none."""
+    return click.option(
+        "--json", "as_json", is_flag=True, callback=_quiet_too, help="Print the result as JSON, and no progress."
+    )(command)
+
+
+def quiet_option(command: Any) -> Any:
+    """``--quiet``: results and warnings, but nothing of how far the command is."""
+    return click.option(
+        "-q", "--quiet", is_flag=True, expose_value=False, callback=_quiet_too, help="Say nothing of progress."
+    )(command)
+
+
+def _quiet_too(context: click.Context, option: click.Parameter, given: bool) -> bool:
+    if given:
+        be_quiet(context)
+    return given
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str | None = None) -> None:
@@ -70,7 +103,7 @@ def _finite(values: Any) -> Any:
     return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
-EPISODES_LINE = "{what}: {done} of {total} episodes, {spent:.0f} s{left}"
+EPISODES_LINE = "{what}: {done} of {episodes}, {spent:.0f} s{left}"
 STEPS_LINE = "step {done} of {total}: {note}{left}"
 """What a line of progress says, elsewhere than on a terminal."""
 
@@ -78,8 +111,8 @@ STEPS_LINE = "step {done} of {total}: {note}{left}"
 class ProgressBar:
     """What is done and time left: a bar on a terminal, a plain line now and then elsewhere."""
 
-    def __init__(self, quiet: bool, line: str = EPISODES_LINE) -> None:
-        self._quiet, self._line = quiet, line
+    def __init__(self, line: str = EPISODES_LINE) -> None:
+        self._quiet, self._line = is_quiet(), line
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -90,7 +123,7 @@ class ProgressBar:
             TextColumn("{task.fields[note]}", markup=False),
             console=_console,
             speed_estimate_period=300,
-            disable=quiet or not _console.is_terminal,
+            disable=self._quiet or not _console.is_terminal,
         )
         self._task = self._bar.add_task("starting", total=None, note="")
         self._start = self._last_line = time.monotonic()
@@ -98,10 +131,12 @@ class ProgressBar:
 
     def __enter__(self) -> Self:
         self._bar.start()
+        PULSE.bars += not self._bar.disable
         return self
 
     def __exit__(self, *failure: object) -> None:
         self._bar.stop()
+        PULSE.bars -= not self._bar.disable
 
     def update(self, done: int, total: int, what: str, note: str = "") -> None:
         """Show that ``done`` of ``total`` are there, and what else there is to say of them."""
@@ -114,8 +149,8 @@ class ProgressBar:
         if not self._quiet and not _console.is_terminal and due:
             fresh, spent = done - self._done_at_start, now - self._start
             left = f", {spent / fresh * (total - done):.0f} s left" if fresh else ""
-            values = {"what": what, "done": done, "total": total, "spent": spent, "left": left, "note": note}
-            say(self._line.format(**values))
+            of = {"done": done, "total": total, "episodes": counted(total, "episode")}
+            say(self._line.format(what=what, spent=spent, left=left, note=note, **of))
             self._last_line = now
 
 

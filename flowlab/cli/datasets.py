@@ -4,22 +4,29 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.cli.console import echo, json_option, print_json, print_table, quiet_option, warn
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import PluginName
 from flowlab.errors import DataError, FlowlabError
+from flowlab.registry import EXPORTERS
+from flowlab.text import counted
 
 if TYPE_CHECKING:
     from flowlab.storage.validation import Finding
 
+_LISTED = 20
+"""So many episodes are listed, unless all are asked for."""
+
 
 @click.command()
 @click.argument("dataset", type=PATH)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def info(dataset: Path, as_json: bool) -> None:
+@click.option("--all", "every", is_flag=True, help="List all episodes, not the first ones.")
+@json_option
+def info(dataset: Path, every: bool, as_json: bool) -> None:
     """Say what a dataset holds and how it was made; of a training run, what its policy is and learned from."""
     if (dataset / "policy.json").is_file():
         from flowlab.cli.run_info import print_run
@@ -30,10 +37,11 @@ def info(dataset: Path, as_json: bool) -> None:
     from flowlab.cli.reports import facts_of_checks, print_checks, print_quality
     from flowlab.pipeline.kept_checks import total_checks
     from flowlab.storage.dataset import open_dataset
-    from flowlab.storage.overview import dataset_overview
+    from flowlab.storage.overview import dataset_overview, list_episodes
 
     data = open_dataset(dataset)
     overview = dataset_overview(data)
+    episodes = [asdict(e) for e in list_episodes(data)]
     tasks, stages = [asdict(t) for t in overview.tasks], [asdict(s) for s in overview.stages]
     arrays = [
         {"array": a.path, "dimensions": ", ".join(a.dims), "shape": " x ".join(map(str, a.shape)), "type": a.dtype,
@@ -56,7 +64,7 @@ def info(dataset: Path, as_json: bool) -> None:
         manifest = data.manifest.model_dump(mode="json")
         recordings = {"recordings": manifest["recordings"]} if manifest["recordings"] else {}
         recordings |= {} if checks is None else {"checks": facts_of_checks(checks)}
-        more = {"tasks": tasks, "arrays": arrays, "stages": stages, "stats": data.stats}
+        more = {"tasks": tasks, "listed": episodes, "arrays": arrays, "stages": stages, "stats": data.stats}
         print_json(
             {**about, **more, "settings": manifest["settings"], "provenance": data.provenance.model_dump(mode="json")}
             | recordings
@@ -65,6 +73,7 @@ def info(dataset: Path, as_json: bool) -> None:
     for name, value in about.items():
         echo(f"{name.replace('_', ' '):<12} {value if value != {} else 'none'}")
     print_table(["task", "episodes", "asked for", "frames", "rejected"], [list(t.values()) for t in tasks])
+    _print_episodes(episodes, every)
     columns = ["array", "dimensions", "shape of the first shard", "type", "unit"]
     print_table(columns, [list(a.values()) for a in arrays])
     limits = [
@@ -79,6 +88,17 @@ def info(dataset: Path, as_json: bool) -> None:
         print_checks(checks)
 
 
+def _print_episodes(episodes: list[dict[str, Any]], every: bool) -> None:
+    """Episodes by the numbers that other commands take: all, or the first ones."""
+    listed = episodes if every else episodes[:_LISTED]
+    columns = [
+        name for name in ("episode", "task", "seed", "frames", "recording") if any(e[name] != "" for e in listed)
+    ]
+    print_table(columns, [[str(e[name]) for name in columns] for e in listed])
+    if len(listed) < len(episodes):
+        echo(f"... and {counted(len(episodes) - len(listed), 'episode')} more; --all lists them")
+
+
 def _numbers(values: list[float]) -> str:
     """At most four numbers of a channel list."""
     return " ".join(f"{v:.3g}" for v in values[:4]) + (" ..." if len(values) > 4 else "")
@@ -86,7 +106,8 @@ def _numbers(values: list[float]) -> str:
 
 @click.command()
 @click.argument("folder", type=PATH)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@quiet_option
+@json_option
 def validate(folder: Path, as_json: bool) -> None:
     """Check a dataset, a training run or an experiment: one line for each finding, exit code 3 if there is any.
 
@@ -102,7 +123,7 @@ def validate(folder: Path, as_json: bool) -> None:
         print_json([{"file": f.place, "problem": f.problem} for f in findings])
     _warn_of_doubts(folder)
     if findings:
-        raise DataError(f"{folder}: {len(findings)} finding{'s' if len(findings) > 1 else ''}")
+        raise DataError(f"{folder}: {counted(len(findings), 'finding')}")
     if not as_json:
         echo(f"{folder}: sound{_reservation(folder)}")
 
@@ -133,15 +154,16 @@ def _warn_of_doubts(folder: Path) -> None:
     with suppress(FlowlabError):
         dataset = Dataset(folder) if (folder / MANIFEST).is_file() else None
         if dataset is not None and (without := missing_actions(dataset)):
-            say(f"warning: {folder}: {without}")
+            warn(f"warning: {folder}: {without}")
         totals = None if dataset is None else total_checks(dataset)
     if totals is None:
         return
     for episode in totals.doubtful:
         for check in episode.doubtful:
-            say(f"warning: {episode.shard}: {episode}: {check.about} is {check.verdict}: {check.says}")
+            warn(f"warning: {episode.shard}: {episode}: {check.about} is {check.verdict}: {check.says}")
     if totals.not_checked:
-        say(f"warning: {folder}: {totals.not_checked} episodes were labeled without checks, by an earlier flowlab")
+        without = counted(totals.not_checked, "episode was", "episodes were")
+        warn(f"warning: {folder}: {without} labeled without checks, by an earlier flowlab")
 
 
 def _reservation(folder: Path) -> str:
@@ -155,11 +177,20 @@ def _reservation(folder: Path) -> str:
 
 @click.command()
 @click.argument("dataset", type=PATH)
-@click.option("--to", "exporter", required=True, metavar="NAME", help="Which tool: lerobot, dp3, or one of a plug-in.")
+@click.option(
+    "--to",
+    "exporter",
+    type=PluginName(EXPORTERS),
+    required=True,
+    metavar="NAME",
+    help="Which tool: lerobot, dp3, or one of a plug-in.",
+)
 @click.option("--out", type=PATH, required=True, help="Where to write.")
 @click.option("--task", help="Only this task's episodes.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change an option of the exporter.")
-def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...]) -> None:
+@quiet_option
+@json_option
+def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: tuple[str, ...], as_json: bool) -> None:
     """Write a dataset in another tool's layout.
 
     lerobot: a LeRobotDataset v3.0. dp3: the zarr v2 store that 3D-Diffusion-Policy's MetaworldDataset loads.
@@ -172,5 +203,8 @@ def export(dataset: Path, exporter: str, out: Path, task: str | None, settings: 
     data = Dataset(dataset)
     count = to.export(data, out, task)
     if data.reservation:
-        say(f"flowlab: {data.reservation}")
-    echo(f"{count} episodes written to {out} for {exporter}")
+        warn(f"flowlab: {data.reservation}")
+    if as_json:
+        print_json({"dataset": str(dataset), "exporter": exporter, "out": str(out), "episodes": count})
+        return
+    echo(f"{counted(count, 'episode')} written to {out} for {exporter}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json
+from flowlab.cli.console import echo, json_option, print_json
 
 if TYPE_CHECKING:
     from flowlab.diagnosis.record import Diagnosis
@@ -16,7 +16,7 @@ _MARKS = {"ok": " ", "note": "-", "problem": "!"}
 
 
 @click.command()
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 def doctor(as_json: bool) -> None:
     """Say what this machine has of what flowlab can use, and what to do where something is missing.
 

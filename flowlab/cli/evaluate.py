@@ -5,30 +5,39 @@ from pathlib import Path
 
 import click
 
-from flowlab.cli.console import ProgressBar, echo, print_json, print_tables
+from flowlab.cli.console import ProgressBar, echo, json_option, print_json, print_tables, quiet_option
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import PluginName, names_option, numbers_option, tasks_and_groups
 from flowlab.errors import UsageError
+from flowlab.registry import ENGINES
 
 
 @click.command("eval")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=PATH)
 @click.option("--episodes", type=click.IntRange(min=1), default=20, show_default=True, help="Of each task and seed.")
-@click.option("--seeds", default="0,1,2", show_default=True, metavar="N,...", help="Evaluation seeds.")
-@click.option("--task", "tasks", multiple=True, help="May be repeated  [all that every policy was trained on].")
+@numbers_option("--seeds", default=["0,1,2"], help="Evaluation seeds  [0,1,2].")
+@names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="[all that every policy was trained on]")
 @click.option("--execute", type=click.IntRange(min=1), help="Steps of a plan to execute: 1 or 8, say  [the policy's].")
 @click.option("--checkpoints", is_flag=True, help="Evaluate every checkpoint of the runs: a learning curve.")
-@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
+@click.option(
+    "--engine",
+    type=PluginName(ENGINES),
+    default="local",
+    show_default=True,
+    help="Where it is done; 'flowlab plugins' lists engines.",
+)
 @click.option("--workers", type=click.IntRange(min=1), help="Processes  [one for each core].")
 @click.option("--device", default="cpu", show_default=True, help="Where plans are made: cpu, cuda, cuda:1.")
 @click.option("--films", type=click.IntRange(min=0), default=0, metavar="N", help="Film N successes and N failures.")
 @click.option("--out", type=PATH, help="Write a report into this folder.")
 @click.option("--offline", is_flag=True, help="No simulator: errors on held-out demonstrations.")
 @click.option("--data", type=PATH, help="With --offline: another dataset than the run's own.")
-@click.option("--json", "as_json", is_flag=True, help="Print the results as JSON, and no progress.")
+@quiet_option
+@json_option
 def evaluate(
     runs: tuple[Path, ...],
     episodes: int,
-    seeds: str,
+    seeds: tuple[int, ...],
     tasks: tuple[str, ...],
     execute: int | None,
     checkpoints: bool,
@@ -54,7 +63,7 @@ def evaluate(
     early, the same command does the rest, and more episodes add to those that are there.
     """
     if offline:
-        given = {"--task": tasks, "--execute": execute, "--checkpoints": checkpoints, "--workers": workers,
+        given = {"--tasks": tasks, "--execute": execute, "--checkpoints": checkpoints, "--workers": workers,
                  "--films": films, "--out": out}  # fmt: skip
         if about_rollouts := [name for name, value in given.items() if value]:
             raise UsageError(f"--offline tries no episodes, so leave out {', '.join(about_rollouts)}")
@@ -65,11 +74,11 @@ def evaluate(
     from flowlab.benchmark.summary import summarize
     from flowlab.evaluation import evaluate as evaluation
 
-    with ProgressBar(quiet=as_json) as bar:
+    with ProgressBar() as bar:
         results = evaluation.evaluate(
             runs,
             tasks=tasks,
-            seeds=parse_seeds(seeds),
+            seeds=seeds,
             episodes=episodes,
             n_action_steps=execute,
             checkpoints=checkpoints,
@@ -117,14 +126,6 @@ def _evaluate_offline(runs: Sequence[Path], data: Path | None, as_json: bool) ->
                 demonstration_table(report, "every demonstration"),
             ]
         )
-
-
-def parse_seeds(text: str) -> list[int]:
-    """Whole numbers from a list with commas."""
-    parts = [p for p in text.replace(" ", "").split(",") if p]
-    if not parts or not all(p.isdecimal() for p in parts):
-        raise UsageError(f"--seeds {text}: must be whole numbers, as in --seeds 0,1,2")
-    return [int(p) for p in parts]
 
 
 def echo_report(folder: Path) -> None:

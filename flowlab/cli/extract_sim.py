@@ -8,25 +8,39 @@ from typing import Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, echo, print_json, show_extraction
+from flowlab.cli.console import ProgressBar, echo, json_option, print_json, quiet_option, show_extraction
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import PluginName, groups, names_argument, names_option, tasks_and_groups
+from flowlab.registry import ENGINES
 
 
 @click.command("extract-sim")
-@click.argument("tasks", nargs=-1, metavar="[TASK]...")
-@click.option("--group", "groups", multiple=True, help="All tasks of a difficulty: easy, medium, hard, very-hard, all.")
+@names_argument("tasks", known=tasks_and_groups, metavar="[TASK]...")
+@names_option("--group", "groups", known=groups, help="All tasks of a difficulty: easy, medium, hard, very-hard, all.")
 @click.option("--episodes", type=click.IntRange(min=1), help="Successful episodes per task [the recipe's: 10].")
 @click.option("--out", type=PATH, required=True, help="Folder of the dataset.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
-@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
+@click.option(
+    "--engine",
+    type=PluginName(ENGINES),
+    default="local",
+    show_default=True,
+    help="Where it is done; 'flowlab plugins' lists engines.",
+)
 @click.option("--recipe", default="metaworld", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: observer.points=512.")
 @click.option("--renderer", type=click.Choice(["zbuffer", "gl"]), help="Short for --set expert.scene.renderer=...")
-@click.option("--without", metavar="WHAT", help="Leave out 'actions', 'state' or 'actions,state', as films do.")
+@names_option(
+    "--without",
+    known=lambda: ["actions", "state"],
+    metavar="WHAT",
+    help="Leave out 'actions', 'state' or 'actions,state', as films do.",
+)
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, with an estimate; write nothing.")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
+@quiet_option
+@json_option
 def extract_sim(
     tasks: tuple[str, ...],
     groups: tuple[str, ...],
@@ -37,7 +51,7 @@ def extract_sim(
     recipe: str,
     overrides: tuple[str, ...],
     renderer: str | None,
-    without: str | None,
+    without: tuple[str, ...],
     shard: str,
     repair: bool,
     dry_run: bool,
@@ -56,20 +70,19 @@ def extract_sim(
     """
     from flowlab.pipeline.extraction import extract
     from flowlab.pipeline.units import JobShard
-    from flowlab.sim.tasks import select_tasks
+    from flowlab.sim.tasks import select_tasks, tasks_named
 
-    chosen = [*tasks, *select_tasks([], groups)]
+    chosen = [*tasks_named(tasks), *select_tasks([], groups)]
     changes = [*overrides, *([f"expert.scene.renderer={renderer}"] if renderer else [])]
     share = JobShard.parse(shard)
-    left_out = [] if without is None else [name.strip() for name in without.split(",")]
     if dry_run:
-        about = {"episodes": episodes, "recipe": recipe, "settings": changes, "without": left_out}
+        about = {"episodes": episodes, "recipe": recipe, "settings": changes, "without": without}
         _dry_run(chosen, out, as_json, **about, workers=workers)
         return
     start = time.monotonic()
-    with ProgressBar(quiet=as_json) as bar:
+    with ProgressBar() as bar:
         dataset = extract(
-            chosen, out, episodes=episodes, recipe=recipe, settings=changes, without=left_out,
+            chosen, out, episodes=episodes, recipe=recipe, settings=changes, without=without,
             engine=engine, workers=workers, shard=share, repair=repair,
             on_progress=lambda progress: show_extraction(bar, progress, "extracting"),
         )  # fmt: skip

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import click
 from pydantic import ValidationError
 
-from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.cli.console import echo, json_option, print_json, print_table, quiet_option, say
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import installed, names_option, tasks_and_groups
 from flowlab.errors import UsageError
+from flowlab.registry import TRACKERS
 
 if TYPE_CHECKING:
     from flowlab.grading.grade import RecordingGrade, TrackerGrade
@@ -27,9 +29,20 @@ _ABOUT_SUMMARY = (
 
 @click.command()
 @click.argument("recordings", nargs=-1, metavar="[RECORDING]...", type=PATH)
-@click.option("--tracker", "names", multiple=True, default=["rigid-bodies"], show_default=True, help="May be repeated.")
-@click.option("--tasks", default="", metavar="TASK,...", help="Simulate recordings of these tasks.")
-@click.option("--scenes", default="", metavar="FAMILY,...", help=f"Film procedural scenes: {_FAMILIES}, or all.")
+@names_option(
+    "--tracker",
+    "names",
+    known=installed(TRACKERS),
+    default=["rigid-bodies"],
+    help="What labels  [rigid-bodies].",
+)
+@names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="Simulate recordings of these tasks.")
+@names_option(
+    "--scenes",
+    known=lambda: _FAMILIES.split(", "),
+    metavar="FAMILY,...",
+    help=f"Film procedural scenes: {_FAMILIES}, or all.",
+)
 @click.option(
     "--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="Recordings of each task and family."
 )
@@ -45,12 +58,13 @@ _ABOUT_SUMMARY = (
 @click.option("--chunk", type=click.IntRange(min=2), help="Frames tracked at a time.")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next.")
 @click.option("--out", type=PATH, default=Path("grade"), show_default=True, help="Folder to write.")
-@click.option("--json", "as_json", is_flag=True, help="Print the grades as JSON, and no progress.")
+@quiet_option
+@json_option
 def grade(
     recordings: tuple[Path, ...],
     names: tuple[str, ...],
-    tasks: str,
-    scenes: str,
+    tasks: tuple[str, ...],
+    scenes: tuple[str, ...],
     episodes: int,
     seed: int,
     sensor: str | None,
@@ -67,7 +81,7 @@ def grade(
     \b
       flowlab grade --tracker rigid-bodies --tasks hammer,door-open
       flowlab grade --scenes tabletop,hands --episodes 6 --seed 1000
-      flowlab grade rec/sample --tracker rigid-bodies --tracker lucas-kanade --out graded
+      flowlab grade rec/sample --tracker rigid-bodies,lucas-kanade --out graded
 
     A RECORDING is a folder with a ground_truth.npz, or holds such folders. With --tasks, MetaWorld's experts
     are recorded by a simulated depth camera, with --scenes, things that move on a table are filmed; the recordings
@@ -76,14 +90,15 @@ def grade(
     """
     from flowlab.grading.run import REPORT
     from flowlab.grading.run import grade as run_grading
+    from flowlab.sim.tasks import tasks_named
     from flowlab.viz.grade_figure import draw_grades
 
     report = run_grading(
         recordings,
         out,
         trackers=names,
-        tasks=_names(tasks),
-        scenes=_names(scenes),
+        tasks=tasks_named(tasks),
+        scenes=scenes,
         episodes=episodes,
         seed=seed,
         sensor=sensor,
@@ -91,7 +106,7 @@ def grade(
         settings=changes,
         weights=weights,
         chunks=_chunk_settings(chunk, stride),
-        on_progress=lambda text: None if as_json else say(text),
+        on_progress=say,
     )
     picture = out / "grade.png"
     draw_grades({t.name: t.mean for t in report.trackers}, picture, graded=report.graded, about=report.about)
@@ -100,11 +115,6 @@ def grade(
         return
     _print(report.trackers)
     echo(f"{out / REPORT} and {picture}")
-
-
-def _names(text: str) -> list[str]:
-    """Names parted by commas."""
-    return [name for name in text.replace(" ", "").split(",") if name]
 
 
 def _size(text: str) -> tuple[int, int]:

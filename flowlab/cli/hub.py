@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json, say
+from flowlab.cli.console import echo, json_option, print_json, quiet_option, say
+from flowlab.cli.heartbeat import is_quiet
 from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
+from flowlab.text import counted
 
 if TYPE_CHECKING:
     from flowlab.hub.connection import HubConnection, RepoState
@@ -35,7 +37,8 @@ def hub() -> None:
 @click.option("--private", is_flag=True, help="Make the repository a private one, if it is not there yet.")
 @click.option("--dry-run", is_flag=True, help="List what would be uploaded, every file; the Hub is not asked.")
 @click.option("--yes", is_flag=True, help="Do not ask before it is uploaded.")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+@quiet_option
+@json_option
 def push(
     path: Path, repo: str, license_name: str | None, private: bool, dry_run: bool, yes: bool, as_json: bool
 ) -> None:
@@ -55,7 +58,7 @@ def push(
         if dry_run:
             _tell_plan(path, plan, "would be uploaded; nothing was", every=True, as_json=as_json)
             return
-        connection = HubConnection(quiet=as_json or not sys.stderr.isatty())
+        connection = HubConnection(quiet=is_quiet() or not sys.stderr.isatty())
         there = connection.find(plan.name, plan.kind)
         replaced = replaced_files(plan, there.sizes) if there else ()
         if not as_json:
@@ -68,14 +71,15 @@ def push(
         if as_json:
             print_json({**_facts(plan), "deleted": len(replaced), "revision": done.revision, "url": url})
         else:
-            echo(f"{path}: {len(plan.sizes):,} files are at {url}")
+            echo(f"{path}: {counted(len(plan.sizes), 'file')} at {url}")
 
 
 @hub.command()
 @click.argument("repo", metavar="USER/NAME[@REVISION]")
 @click.option("--out", type=PATH, help="Folder to make  [NAME].")
 @click.option("--kind", type=click.Choice(["dataset", "policy"]), help="[what there is of this name].")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+@quiet_option
+@json_option
 def pull(repo: str, out: Path | None, kind: str | None, as_json: bool) -> None:
     """Download a dataset or a policy.
 
@@ -93,8 +97,8 @@ def pull(repo: str, out: Path | None, kind: str | None, as_json: bool) -> None:
 
     name = HubName.parse(repo)
     place = out or Path(name.repo.partition("/")[2])
-    connection = HubConnection(quiet=as_json or not sys.stderr.isatty())
-    done = pull(name, place, connection, kind, say if not as_json else lambda text: None)  # type: ignore[arg-type]
+    connection = HubConnection(quiet=is_quiet() or not sys.stderr.isatty())
+    done = pull(name, place, connection, kind, say)  # type: ignore[arg-type]
     if as_json:
         print_json(
             {"kind": done.kind, "repo": done.name.repo, "revision": done.name.revision, "folder": str(done.folder),
@@ -128,7 +132,7 @@ def _tell_plan(path: Path, plan: "PlannedPush", what: str, *, every: bool, as_js
         print_json(_facts(plan))
         return
     _list(plan.sizes, "", every=every)
-    echo(f"{path}: {plan.kind} {plan.name}, {len(plan.sizes):,} files, {_size(plan.total)} {what}")
+    echo(f"{path}: {plan.kind} {plan.name}, {counted(len(plan.sizes), 'file')}, {_size(plan.total)} {what}")
     echo(f"license: {plan.staged.license or 'not stated, so that nobody may use it; --license says it'}")
     if plan.staged.places:
         echo(f"local paths are cut to their last names in: {', '.join(plan.staged.places)}")
@@ -153,7 +157,8 @@ def _list(sizes: Mapping[str, int], before: str, *, every: bool) -> None:
             for name, size in files.items():
                 echo(f"{before}{name}  {_size(size)}")
         else:
-            echo(f"{before}{folder}/  {len(files):,} files, {_size(sum(files.values()))}; --dry-run lists them all")
+            whole = _size(sum(files.values()))
+            echo(f"{before}{folder}/  {counted(len(files), 'file')}, {whole}; --dry-run lists them all")
 
 
 def _size(size: int) -> str:

@@ -9,7 +9,7 @@ from flowlab.perception.observer import Box
 from flowlab.pipeline.inspection import InspectedRecording
 from flowlab.recordings.recording import StreamInfo
 from flowlab.storage.recorded import Recorded
-from flowlab.text import file_name
+from flowlab.text import counted, file_name
 
 _SHOWN = 5
 """Bad frames that people are shown of one recording; JSON has all."""
@@ -62,7 +62,7 @@ def draw_sheet(one: InspectedRecording, png: Path, crop: Box | None) -> None:
     found, preview = one.description, one.preview
     assert preview is not None
     checks = () if found is None else found.checks
-    rows = "" if found is None else f"   {found.rows} rows, read as a {found.reader} recording"
+    rows = "" if found is None else f"   {counted(found.rows, 'row')}, read as a {found.reader} recording"
     title = f"{one.recorded.task}/{one.recorded.name}{rows}"
     draw_recording_sheet(preview, png, title=title, checks=checks, problem=one.problem, crop=crop)
 
@@ -74,7 +74,7 @@ def _stream(s: StreamInfo) -> dict[str, Any]:
 
 def lines_of(facts: dict[str, Any]) -> Iterator[str]:
     """The same for people: first the recording, then a line for everything known of it."""
-    rows = f", {facts['rows']} rows, read as a {facts['reader']} recording" if "reader" in facts else ""
+    rows = f", {counted(facts['rows'], 'row')}, read as a {facts['reader']} recording" if "reader" in facts else ""
     yield f"{facts['recording']}: task '{facts['task']}'{rows}"
     if "reader" in facts:
         for name, value in _known(facts):
@@ -96,7 +96,7 @@ def _known(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for key, place in facts["calibration"].items():
         places.setdefault(place, []).append(key)
     yield "known", "; ".join(f"{', '.join(keys)} from {place}" for place, keys in places.items()) or "nothing else"
-    yield "robot", f"state of {facts['state_width']} numbers, action of {facts['action_width']}"
+    yield "robot", f"state of {counted(facts['state_width'], 'number')}, action of {facts['action_width']}"
     for name, reason in facts["bad_frames"][:_SHOWN]:
         yield "bad frame", f"{name}: {reason}"
     if len(facts["bad_frames"]) > _SHOWN:
@@ -109,4 +109,4 @@ def _gaps(gaps: list[list[float]]) -> str:
     if not gaps:
         return "no gaps"
     start, length = max(gaps, key=lambda gap: gap[1])
-    return f"{len(gaps)} gaps, the longest of {length:.2f} s at {start:.2f} s"
+    return f"{counted(len(gaps), 'gap')}, the longest of {length:.2f} s at {start:.2f} s"

@@ -7,9 +7,12 @@ from typing import Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, echo, print_table, show_extraction
+from flowlab.cli.console import ProgressBar, echo, json_option, print_table, quiet_option, show_extraction
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import PluginName
 from flowlab.provenance import Channels, Inferred, Provenance
+from flowlab.registry import ENGINES
+from flowlab.text import counted
 
 
 @click.command("label-actions")
@@ -18,10 +21,17 @@ from flowlab.provenance import Channels, Inferred, Provenance
 @click.option("--out", type=PATH, required=True, help="Folder of the new dataset.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: max_position_m=0.01.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
-@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
+@click.option(
+    "--engine",
+    type=PluginName(ENGINES),
+    default="local",
+    show_default=True,
+    help="Where it is done; 'flowlab plugins' lists engines.",
+)
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
+@quiet_option
+@json_option
 def label_actions(
     films: Path,
     labeled: Path,
@@ -48,7 +58,7 @@ def label_actions(
     from flowlab.pipeline.units import JobShard
 
     start, share = time.monotonic(), JobShard.parse(shard)
-    with ProgressBar(quiet=as_json) as bar:
+    with ProgressBar() as bar:
         dataset = label(
             films, labeled, out, settings=overrides, engine=engine, workers=workers, shard=share, repair=repair,
             on_progress=lambda progress: show_extraction(bar, progress, "labeling", count_rejects=True),
@@ -62,8 +72,8 @@ def print_inferred(provenance: Provenance, inferred: Inferred) -> None:
     """What was inferred, from what, and how far off it was on demonstrations that were left out."""
     for task, count in inferred.demonstrations.items():
         echo(
-            f"{' and '.join(inferred.what)} of {task}: inferred by what {count} demonstrations of {inferred.labeled} "
-            f"taught ({inferred.method}); on demonstrations left out:"
+            f"{' and '.join(inferred.what)} of {task}: inferred by what {counted(count, 'demonstration')} of "
+            f"{inferred.labeled} taught ({inferred.method}); on demonstrations left out:"
         )
         rows = [
             [f"{e.array}[{e.index}]", _name(getattr(provenance, e.array), e.index), f"{e.mean_error:.3g}",

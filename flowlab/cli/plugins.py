@@ -4,14 +4,15 @@ from dataclasses import asdict
 
 import click
 
-from flowlab.cli.console import echo, print_json
+from flowlab.cli.console import echo, json_option, print_json
+from flowlab.cli.values import names_argument
 from flowlab.registry import REGISTRIES, registry_of
 
 
 @click.command()
-@click.argument("families", nargs=-1, metavar="[FAMILY]...")
+@names_argument("families", known=lambda: [r.family for r in REGISTRIES], metavar="[FAMILY]...")
 @click.option("--check", is_flag=True, help="Import flowlab's own, too, which takes some seconds.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 def plugins(families: tuple[str, ...], check: bool, as_json: bool) -> None:
     """List what can be named: its family, name and import path, and which package offers it.
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from flowlab.cli.console import print_json, print_tables
+from flowlab.cli.console import json_option, print_json, print_tables, quiet_option
 from flowlab.cli.evaluate import echo_report
 from flowlab.cli.paths import PATH
 from flowlab.errors import UsageError
@@ -14,7 +14,8 @@ from flowlab.errors import UsageError
 @click.argument("sources", nargs=-1, required=True, metavar="SOURCE...", type=PATH)
 @click.option("--out", type=PATH, help="Folder to write  [SOURCE, if it is an experiment].")
 @click.option("--recipe", help="The experiment's, so that the report says what is missing: a name, or a YAML file.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@quiet_option
+@json_option
 def report(sources: tuple[Path, ...], out: Path | None, recipe: str | None, as_json: bool) -> None:
     """Write a report of evaluations: report.html, report.json, CSV.
 

@@ -3,13 +3,13 @@
 from dataclasses import asdict
 from typing import Any
 
-from flowlab.cli.console import echo, print_json, print_table, say
+from flowlab.cli.console import echo, print_json, print_table, warn
 from flowlab.errors import DataError
 from flowlab.pipeline.kept_checks import CheckTotals
 from flowlab.pipeline.units import JobShard
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.overview import frame_count, left_out_frames, stage_totals, task_totals
-from flowlab.text import cut
+from flowlab.text import counted, cut
 
 _SHOWN = 10
 """So many bad frames and rejects are printed; the rest is in files."""
@@ -43,7 +43,7 @@ def finish_extraction(dataset: Dataset, seconds: float, share: JobShard, as_json
     else:
         print_extraction(report)
     if dataset.missing and share.count > 1:
-        say("the rest belongs to the other shards")
+        warn("the rest belongs to the other shards")
     elif not len(dataset):
         raise DataError(
             f"{dataset.path}: holds no episode, for all {len(dataset.rejects)} that were tried are rejected; mend what "
@@ -75,7 +75,7 @@ def facts_of_checks(totals: CheckTotals) -> dict[str, Any]:
 def print_checks(totals: CheckTotals) -> None:
     """What was found when recordings were checked: how many of each verdict, and the doubts."""
     counts = ", ".join(f"{n} {verdict}" for verdict, n in totals.verdicts.items() if n)
-    missing = f"{totals.not_checked} episodes not checked" if totals.not_checked else ""
+    missing = f"{counted(totals.not_checked, 'episode')} not checked" if totals.not_checked else ""
     echo(f"checks of recordings: {'; '.join(filter(None, (counts, missing)))}")
     doubts = [(episode, check) for episode in totals.doubtful for check in episode.doubtful]
     for episode, check in doubts[:_SHOWN]:
@@ -92,7 +92,7 @@ def print_extraction(report: dict[str, Any]) -> None:
     for bad in report.get("bad_frames", ())[:_SHOWN]:
         echo(f"left out of {bad['recording']}: {bad['frame']} {bad['reason']}")
     if len(report.get("bad_frames", ())) > _SHOWN:
-        echo(f"... and {len(report['bad_frames']) - _SHOWN} bad frames more; --json lists all")
+        echo(f"... and {counted(len(report['bad_frames']) - _SHOWN, 'bad frame')} more; --json lists all")
     for reject in report["rejects"][:_SHOWN]:
         who = reject.get("source") or f"{reject['task']} seed {reject['seed']}"
         echo(f"rejected {who} at {reject['stage']}: {reject['reason']}")
@@ -100,6 +100,6 @@ def print_extraction(report: dict[str, Any]) -> None:
         echo(f"... and {len(report['rejects']) - _SHOWN} more, all in {report['dataset']}/rejects.jsonl")
     next_step = f" Next: flowlab validate {report['dataset']}" if report["episodes"] else ""
     echo(
-        f"{report['episodes']} episodes, {report['frames']} frames in {report['dataset']} "
+        f"{counted(report['episodes'], 'episode')}, {counted(report['frames'], 'frame')} in {report['dataset']} "
         f"({report['wall_s']:.1f} s).{next_step}"
     )

@@ -5,19 +5,20 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json
+from flowlab.cli.console import echo, json_option, print_json, quiet_option
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import names_option
+from flowlab.text import counted
 
 if TYPE_CHECKING:
     from flowlab.storage.dataset import Dataset
-
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
 @click.command()
 @click.argument("datasets", type=PATH, nargs=-1, required=True, metavar="DATASET DATASET...")
 @click.option("--out", type=PATH, required=True, help="Folder of the new dataset.")
-@_JSON
+@quiet_option
+@json_option
 def merge(datasets: tuple[Path, ...], out: Path, as_json: bool) -> None:
     """Make one dataset of several that say the same of their frame, camera and numbers.
 
@@ -31,15 +32,16 @@ def merge(datasets: tuple[Path, ...], out: Path, as_json: bool) -> None:
 
 @click.command()
 @click.argument("dataset", type=PATH)
-@click.option("--tasks", metavar="TASK,...", help="Only these tasks.")
+@names_option("--tasks", "--task", "tasks", help="Only these tasks.")
 @click.option(
     "--episodes",
     metavar="N,A:B,...",
     help="Only these, counted from 0 within the tasks, in the order of 'flowlab viz --episode'; B is not in A:B.",
 )
 @click.option("--out", type=PATH, required=True, help="Folder of the new dataset.")
-@_JSON
-def subset(dataset: Path, tasks: str | None, episodes: str | None, out: Path, as_json: bool) -> None:
+@quiet_option
+@json_option
+def subset(dataset: Path, tasks: tuple[str, ...], episodes: str | None, out: Path, as_json: bool) -> None:
     """Make a dataset of some episodes of another one.
 
     \b
@@ -49,8 +51,7 @@ def subset(dataset: Path, tasks: str | None, episodes: str | None, out: Path, as
     """
     from flowlab.storage.selection import subset
 
-    names = None if tasks is None else [name.strip() for name in tasks.split(",")]
-    _tell([subset(dataset, out, tasks=names, episodes=episodes)], as_json)
+    _tell([subset(dataset, out, tasks=tasks or None, episodes=episodes)], as_json)
 
 
 @click.command()
@@ -58,7 +59,8 @@ def subset(dataset: Path, tasks: str | None, episodes: str | None, out: Path, as
 @click.option("--val", type=float, default=0.1, show_default=True, help="Share of each task's episodes to validate on.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the draw.")
 @click.option("--out", type=PATH, help="What the new names begin with: OUT-train, OUT-val  [DATASET].")
-@_JSON
+@quiet_option
+@json_option
 def split(dataset: Path, val: float, seed: int, out: Path | None, as_json: bool) -> None:
     """Make two datasets of one, to train on and to validate on: of every task the same share, drawn at random."""
     from flowlab.storage.selection import split
@@ -78,6 +80,7 @@ def _tell(made: "list[Dataset]", as_json: bool) -> None:
     if as_json:
         print_json(facts if len(facts) > 1 else facts[0])
         return
-    for dataset, about in zip(made, facts, strict=True):
+    for dataset in made:
         tasks = ", ".join(f"{t.task} {t.episodes}" for t in task_totals(dataset))
-        echo(f"{dataset.path}: {about['episodes']} episodes, {about['frames']} frames ({tasks})")
+        held = f"{counted(len(dataset), 'episode')}, {counted(frame_count(dataset), 'frame')}"
+        echo(f"{dataset.path}: {held} ({tasks})")

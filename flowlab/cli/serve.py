@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, print_json, say
+from flowlab.cli.console import echo, json_option, print_json, say
+from flowlab.cli.heartbeat import PULSE
 from flowlab.cli.paths import PATH
 from flowlab.errors import MissingLibraryError
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--execute", type=click.IntRange(min=1), help="Steps of a plan that clients execute  [as in training].")
 @click.option("--device", default="cpu", show_default=True, help="Where plans are made: cpu, cuda, cuda:1.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of a client's first episode.")
-@click.option("--json", "as_json", is_flag=True, help="Print the URL and the policy's contract as JSON.")
+@json_option
 def serve(
     run: Path, host: str, port: int, task: str | None, execute: int | None, device: str, seed: int, as_json: bool
 ) -> None:
@@ -62,6 +63,7 @@ def serve(
             about = f"{served.network.spec.settings.policy}, {served.training_steps} training steps"
             echo(f"serving {run} ({about}; a plan takes {1000 * seconds:.0f} ms) at {url}; Ctrl-C ends it")
 
+    PULSE.bars += 1  # it waits for clients, and that needs no telling
     asyncio.run(_until_stopped(PolicyServer(served, say), host, port, listening))
     say("stopped")
 

@@ -2,16 +2,18 @@
 
 import click
 
-from flowlab.cli.console import echo, print_json, print_table
+from flowlab.cli.console import echo, json_option, print_json, print_table
+from flowlab.cli.values import groups as group_names
+from flowlab.cli.values import names_option
 from flowlab.sim.tasks import GROUPS, TASKS, select_tasks
 
 
 @click.command()
-@click.option("--group", type=click.Choice(list(GROUPS)), default="all", show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def tasks(group: str, as_json: bool) -> None:
+@names_option("--group", "groups", known=group_names, default=["all"], help="Of this difficulty  [all].")
+@json_option
+def tasks(groups: tuple[str, ...], as_json: bool) -> None:
     """List MetaWorld's tasks with their difficulty and scripted expert."""
-    chosen = [TASKS[name] for name in select_tasks([], [group])]
+    chosen = [TASKS[name] for name in select_tasks([], groups)]
     if as_json:
         print_json([{"task": t.name, "difficulty": t.difficulty, "expert": t.expert} for t in chosen])
         return

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import ProgressBar, echo, print_json, say, show_extraction
+from flowlab.cli.console import ProgressBar, echo, json_option, print_json, quiet_option, say, show_extraction
 from flowlab.cli.paths import PATH
+from flowlab.cli.values import PluginName
 from flowlab.errors import DataError, UsageError
+from flowlab.registry import ENGINES, READERS, TRACKERS
+from flowlab.text import counted
 
 if TYPE_CHECKING:
     from flowlab.pipeline.recipe import Recipe
@@ -20,22 +23,35 @@ if TYPE_CHECKING:
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
 @click.option("--out", type=PATH, help="Folder of the dataset; not needed for --dry-run.")
 @click.option("--task", help="Task of all these recordings [what they say, or the name of their folder].")
-@click.option("--tracker", help="Short for --set track.tracker=NAME [the recipe's: rigid-bodies].")
+@click.option(
+    "--tracker", type=PluginName(TRACKERS), help="Short for --set track.tracker=NAME [the recipe's: rigid-bodies]."
+)
 @click.option("--chunk", type=click.IntRange(min=1), help="Frames to a chunk [the recipe's: 33].")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next [the recipe's: 8].")
 @click.option("--weights", type=PATH, help="File with a learned tracker's weights.")
-@click.option("--reader", help="Short for --set recording.reader=NAME [the one that recognizes the recording].")
+@click.option(
+    "--reader",
+    type=PluginName(READERS),
+    help="Short for --set recording.reader=NAME [the one that recognizes the recording].",
+)
 @click.option("--calibration", type=PATH, help="YAML file with calibration for all of them.")
 @click.option("--recipe", default="real", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
-@click.option("--engine", default="local", show_default=True, help="Where it is done; 'flowlab plugins' lists engines.")
+@click.option(
+    "--engine",
+    type=PluginName(ENGINES),
+    default="local",
+    show_default=True,
+    help="Where it is done; 'flowlab plugins' lists engines.",
+)
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what is recognized; write nothing.")
 @click.option("--png", type=PATH, help="With --dry-run: draw a sheet of each recording here, to look at.")
 @click.option("--estimate", is_flag=True, help="With --dry-run: label some frames to tell how long all would take.")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
+@quiet_option
+@json_option
 def track_real(
     paths: tuple[Path, ...],
     out: Path | None,
@@ -86,9 +102,8 @@ def track_real(
     from flowlab.pipeline.labeling import label, labeling_recipe
 
     start = time.monotonic()
-    if not as_json:
-        _say_if_compiling(labeling_recipe(recipe, changes, **known))
-    with ProgressBar(quiet=as_json) as bar:
+    _say_if_compiling(labeling_recipe(recipe, changes, **known))
+    with ProgressBar() as bar:
         dataset = label(
             paths, out, task=task, tracker=tracker, calibration=calibration, weights=weights, recipe=recipe,
             settings=changes, engine=engine, workers=workers, shard=share,
@@ -131,7 +146,7 @@ def _dry_run(
             facts[-1]["sheet"] = str(sheet)
         if not as_json:
             echo(*lines_of(facts[-1]))
-    if estimate and not as_json:
+    if estimate:
         _say_if_compiling(chosen)
     plan = asdict(estimate_labeling(chosen, inspected, workers)) if estimate else {"frames": frame_count(inspected)}
     if as_json:
@@ -141,4 +156,4 @@ def _dry_run(
             echo(f"{name.replace('_', ' '):<18} {value}")
     problems = sum(one.problem is not None for one in inspected)
     if problems:
-        raise DataError(f"{problems} of {len(inspected)} recordings cannot be used as they are; see above")
+        raise DataError(f"{problems} of {counted(len(inspected), 'recording')} cannot be used as they are; see above")

@@ -7,8 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from flowlab.cli.console import STEPS_LINE, ProgressBar, echo, print_json, print_table, say, show_training
+from flowlab.cli.console import (
+    STEPS_LINE,
+    ProgressBar,
+    echo,
+    json_option,
+    print_json,
+    print_table,
+    quiet_option,
+    say,
+    show_training,
+)
+from flowlab.cli.heartbeat import be_quiet
 from flowlab.cli.paths import PATH, PATH_OR_HUB
+from flowlab.cli.values import Names, PluginName, flat, installed
 from flowlab.errors import UsageError
 from flowlab.registry import LOGGERS, POLICIES, Registry
 
@@ -21,7 +33,7 @@ class PluginOption(click.Option):
     """An option whose value is a name of a registry: its help lists those that are installed."""
 
     def __init__(self, *declarations: Any, registry: Registry[Any], **attributes: Any) -> None:
-        super().__init__(*declarations, **attributes)
+        super().__init__(*declarations, **({"type": PluginName(registry)} | attributes))
         self._registry = registry
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
@@ -49,9 +61,11 @@ class PluginOption(click.Option):
 @click.option("--threads", type=click.IntRange(min=1), help="CPU threads of each process  [1].")
 @click.option("--precision", type=click.Choice(["fp32", "bf16"]), help="[bf16 where the device has units for it].")
 @click.option(
-    "--log", "logs", cls=PluginOption, registry=LOGGERS, multiple=True, metavar="NAME", help="Also log there."
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON, and no progress.")
+    "--log", "logs", cls=PluginOption, registry=LOGGERS, type=Names(installed(LOGGERS)), callback=flat, multiple=True,
+    metavar="NAME,...", help="Also log there.",
+)  # fmt: skip
+@quiet_option
+@json_option
 def train(
     sources: tuple[Path, ...],
     weights: str | None,
@@ -107,13 +121,19 @@ def train(
             f"say what to train and where to save it, as in 'flowlab train {sources[0]} --policy fdp --out runs/fdp'; "
             "--resume goes on with a run"
         )
+    else:
+        from flowlab.training.request import check_request
+
+        timed = minutes is not None
+        check_request(sources, policy=policy, profile=profile or "fast", settings=overrides, timed=timed, logs=logs)
     from flowlab.training import train as training
     from flowlab.training.distributed import is_first_process
 
     first = is_first_process()
-    quiet = as_json or not first
-    with ProgressBar(quiet, STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
-        watch = training.Watch(_silent if quiet else say, partial(show_training, bar), should_stop)
+    if not first:
+        be_quiet()
+    with ProgressBar(STEPS_LINE) as bar, training.stop_on_signal() as should_stop:
+        watch = training.Watch(say, partial(show_training, bar), should_stop)
         if resume:
             done = training.resume(
                 sources[0], device=device, threads=threads, precision=precision, logs=logs or None, watch=watch
@@ -140,10 +160,6 @@ def _numbers(text: str | None) -> list[float] | None:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
         raise UsageError(f"--weights {text}: must be numbers with commas between them, as in 0.7,0.3") from error
-
-
-def _silent(text: str) -> None:
-    """Not in JSON, nor in other processes than the first."""
 
 
 def _print(done: "TrainedRun", as_json: bool) -> None:

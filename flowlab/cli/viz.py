@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from flowlab.cli.console import echo
+from flowlab.cli.console import echo, json_option, print_json, quiet_option
 from flowlab.cli.paths import PATH
 
 
@@ -23,6 +23,8 @@ from flowlab.cli.paths import PATH
 @click.option("--png", type=PATH, help="Draw a still here.")
 @click.option("--mp4", type=PATH, help="Write a film of the pictures here, tracks drawn in.")
 @click.option("--fps", type=click.FloatRange(min=0.1, max=240), help="Frames a second of the film [real time].")
+@quiet_option
+@json_option
 def viz(
     source: Path,
     episode: int,
@@ -33,6 +35,7 @@ def viz(
     png: Path | None,
     mp4: Path | None,
     fps: float | None,
+    as_json: bool,
 ) -> None:
     """Draw an episode: cloud, query points, their tracks over time, and where a policy predicted them.
 
@@ -55,15 +58,21 @@ def viz(
     if fps is not None and mp4 is None:
         raise UsageError("--fps is about the film; give --mp4 FILE too")
     view = view_episode(source, episode, task=task, seed=seed, rejects=rejects)
-    if view.note:
+    if save is None and png is None and mp4 is None:
+        save = Path(file_name(f"{view.episode.task}-{view.episode.seed:06d}") + ".rrd")
+    if view.note and not as_json:
         echo(f"{view.name} was {view.note}")
     if png is not None:
         view.write_png(png)
-        echo(f"{view.name}: {png}")
     if mp4 is not None:
         view.write_mp4(mp4, fps=fps)
-        echo(f"{view.name}: {mp4}")
-    if save is not None or (png is None and mp4 is None):
-        save = save or Path(file_name(f"{view.episode.task}-{view.episode.seed:06d}") + ".rrd")
+    if save is not None:
         view.write_rrd(save)
-        echo(f"{view.name}: {save}; open it with: rerun {save}")
+    written = {"png": png, "mp4": mp4, "rrd": save}
+    if as_json:
+        about = {"episode": view.name, "task": view.episode.task, "seed": view.episode.seed, "note": view.note or None}
+        print_json(about | {kind: None if path is None else str(path) for kind, path in written.items()})
+        return
+    for kind, path in written.items():
+        if path is not None:
+            echo(f"{view.name}: {path}" + (f"; open it with: rerun {path}" if kind == "rrd" else ""))

@@ -14,8 +14,11 @@ from flowlab.data.source import SourcePart
 from flowlab.data.training_settings import TrainSettings
 from flowlab.data.window_sampler import MixedSampler, WindowSampler, index_windows, shares
 from flowlab.errors import DataError, UsageError
+from flowlab.text import counted
 
 Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, lt=1 << 62)]
+"""Of what a file says that there is."""
 
 
 class MixedDataset(Settings):
@@ -25,9 +28,9 @@ class MixedDataset(Settings):
     """Of its content."""
     weight: Weight
     """Relative to those of the others; what part of all windows it means, :func:`mixture_shares` tells."""
-    demonstrations: int
+    demonstrations: Count
     """So many of it were trained on."""
-    held_out: int
+    held_out: Count
     hub: Annotated[str, later("")] = ""
     """Where on the Hub it was pulled from, ``user/name@commit``; empty where it was not."""
 
@@ -42,7 +45,8 @@ class DatasetShare:
 
     def __str__(self) -> str:
         held = f" ({self.about.held_out} held out)" if self.about.held_out else ""
-        return f"{self.name}: {self.share:.4g} of the windows, from {self.about.demonstrations} demonstrations{held}"
+        taught = counted(self.about.demonstrations, "demonstration")
+        return f"{self.name}: {self.share:.4g} of the windows, from {taught}{held}"
 
 
 def check_weights(value: Any, datasets: int) -> tuple[float, ...]:
@@ -87,7 +91,7 @@ def describe_mixture(
         if k not in taught:
             there = sum(e.origin == k for e in buffer.episodes)
             raise DataError(
-                f"{part.path}: its weight is {weights[k]:g}, and none of its {there} demonstrations is trained on "
+                f"{part.path}: its weight is {weights[k]:g}, and none of its demonstrations ({there}) is trained on "
                 f"({held.count(k)} held out); leave it out, or choose others by data.held_out, data.demonstrations or "
                 "--overfit"
             )
@@ -101,6 +105,11 @@ def describe_mixture(
         )
         for k, part in enumerate(parts)
     )
+
+
+def without_names(mixture: Sequence[MixedDataset]) -> list[MixedDataset]:
+    """What counts of a mixture: the same content may be pulled from elsewhere, or not from the Hub."""
+    return [one.model_copy(update={"hub": ""}) for one in mixture]
 
 
 def check_drawn(parts: Sequence[SourcePart], weights: Sequence[float], settings: TrainSettings, steps: int) -> None:

@@ -11,7 +11,7 @@ from flowlab.arguments import check_path
 from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
-from flowlab.storage.compatibility import check_alike, check_trained_together, known_scenes
+from flowlab.storage.compatibility import check_alike, check_trained_together, known_scenes, unsaid_meaning
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import DatasetView
 from flowlab.storage.importers.dp3 import DP3Store
@@ -105,6 +105,12 @@ def _joined(datasets: Sequence[Dataset], check: Callable[[Sequence[Dataset]], No
         content,
         parts=parts,
     )
+
+
+def warn_of_what_is_unsaid(source: TrainingSource) -> None:
+    """Warn of several datasets that may be alike in nothing but how many numbers their rows have."""
+    if source.parts and (unsaid := unsaid_meaning(source.provenance, source.paths)):
+        _LOG.warning("flowlab: %s", unsaid)
 
 
 def warn_of_shared_scenes(parts: Sequence[SourcePart]) -> None:

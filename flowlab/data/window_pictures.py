@@ -11,6 +11,7 @@ from flowlab.data.cache import cached_part
 from flowlab.data.replay_buffer import pictures_of
 from flowlab.data.source import TrainingSource
 from flowlab.errors import DataError, UsageError
+from flowlab.limits import MAX_LOADED_BYTES
 from flowlab.provenance import Provenance
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.pictures import StoredPictures, kinds_of_pictures
@@ -63,6 +64,11 @@ class WindowPictures:
             if dataset is None or name not in self.kinds:
                 raise DataError(_missing(source.path, source.provenance, name))
             found = StoredPictures(dataset, name)
+            if where == "stored" and found.chunk_bytes > MAX_LOADED_BYTES:
+                raise DataError(
+                    f"{source.path}: '{name}' lies together in chunks of {found.chunk_bytes:,} bytes, of which at most "
+                    f"{MAX_LOADED_BYTES:,} are read for one picture; give pictures='decoded'"
+                )
             if where == "stored" or (where is None and found.is_quick(_QUICK_BYTES)):
                 self.stored[name] = found
             else:

@@ -1,5 +1,6 @@
 """The engine that runs work units on the machines of a Ray cluster."""
 
+import logging
 import os
 import socket
 import traceback
@@ -13,6 +14,10 @@ from typing import Any, Generic, Self
 from flowlab.engines.base import WORKER_ENVIRONMENT, Engine, Receipt, Unit, UnitResult
 from flowlab.errors import FlowlabError, MissingLibraryError, UsageError, first_line
 from flowlab.version import __version__
+
+_CLIENT = "ray://"
+"""Begins the address of a server of Ray Client, which warns of any setting but its own two."""
+_OWN_WORDS = {"log_to_driver": False, "logging_level": "ERROR"}
 
 
 class RayEngine(Engine[Unit, Receipt]):
@@ -134,7 +139,8 @@ def _connected() -> Any:
     address = os.environ.get("RAY_ADDRESS", "auto")
     try:
         _check_reachable(address)
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        logging.getLogger("ray").setLevel(logging.ERROR)
+        ray.init(address=address, **({} if address.startswith(_CLIENT) else _OWN_WORDS))
     except (OSError, RuntimeError, ValueError) as error:
         raise UsageError(
             f"--engine ray finds no Ray cluster at {address!r} ({first_line(error)}); start one with "
@@ -145,6 +151,6 @@ def _connected() -> Any:
 
 def _check_reachable(address: str) -> None:
     """Raise :class:`OSError` where nobody listens at HOST:PORT: Ray itself would try for minutes."""
-    host, _, port = address.rpartition(":")
+    host, _, port = address.removeprefix(_CLIENT).rpartition(":")
     if host and port.isdigit() and "/" not in host:
         socket.create_connection((host, int(port)), timeout=5).close()

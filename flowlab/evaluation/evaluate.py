@@ -22,6 +22,7 @@ from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
 from flowlab.registry import POLICIES
 from flowlab.sim.scene_settings import SceneSettings
+from flowlab.text import counted
 
 _LARGEST_BATCH = 40
 """Episodes given to a worker at a time: few enough that progress shows."""
@@ -177,7 +178,7 @@ def _run_batches(
             on_progress(done, total)
     if failures:
         raise UnfinishedError(
-            f"{total - done} of {total} episodes could not be tried; the first failure: "
+            f"{total - done} of {counted(total, 'episode')} could not be tried; the first failure: "
             f"{failures[0].splitlines()[-1]}; the same command tries them again"
         )
 

@@ -11,7 +11,7 @@ from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.policies.base import PolicySpec
 from flowlab.policies.checkpoint import RUN, LoadedPolicy, TrainedPolicy, check_observer
-from flowlab.policies.run_folder import RunConfig, read_run_config
+from flowlab.policies.run_folder import RunConfig, check_positions, read_run_config
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.shard import Shard
 from flowlab.untrusted import is_there
@@ -94,6 +94,7 @@ def _unseen(loaded: LoadedPolicy, run: Path, source: TrainingSource, buffer: Rep
     """Positions of the demonstrations that the policy knows the task of, and was not trained on."""
     if source.fingerprint == loaded.trained.fingerprint:
         planned = _read_plan(run)
+        check_positions(run, planned, len(buffer.episodes))
         if found := [k for k in planned.held_out if k not in planned.train]:
             return found
         raise DataError(
@@ -115,6 +116,8 @@ def _known_scenes(trained: TrainedPolicy, run: Path, source: TrainingSource) -> 
     planned = read_run_config(run) if (run / RUN).exists() else None
     if source.provenance.is_simulated:
         scene_seeds = [(task, seed) for task in sorted(trained.scene_seeds) for seed in trained.scene_seeds[task]]
+        if scene_seeds and planned is not None:
+            check_positions(run, planned, len(scene_seeds))
         return set([scene_seeds[k] for k in planned.train] if scene_seeds and planned is not None else scene_seeds)
     if planned is not None and source.path.resolve() in planned.datasets:
         raise DataError(

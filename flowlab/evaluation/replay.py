@@ -19,10 +19,13 @@ from flowlab.policies.checkpoint import load_policy
 from flowlab.records import Episode, FlowPrediction, Queries
 from flowlab.sim.exact_tracks import RigidFlowSettings, label
 from flowlab.sim.recorder import EpisodeRecorder, Rollout, TaskSimulator
+from flowlab.sim.render.gl import GLRenderer
 from flowlab.sim.scene_settings import SceneSettings
 
 _TALLEST_PX = 480
 """MetaWorld's models let OpenGL draw no more rows than this."""
+_SHADOW_PX = 1024
+"""Of the map that shadows are drawn from: MuJoCo's own 4096 take most of a picture's time without a GPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,15 +79,21 @@ def _with_large_pictures(observed: ObservedDemo, scene: SceneSettings) -> Observ
     camera = c.model_copy(update={"width": factor * c.width, "height": factor * c.height})
     recorder = _begin_in_color(rollout, scene.model_copy(update={"camera": camera}))
     taken = replace(rollout, camera=recorder.camera, renderer=recorder.renderer)
-    frames = [taken.frame(t) for t in range(len(taken))]
-    rgb = None if frames[0].rgb is None else np.stack([f.rgb for f in frames if f.rgb is not None])
-    return replace(observed, demo=taken, depth=np.stack([f.depth for f in frames]), owner=None, rgb=rgb)
+    if isinstance(recorder.renderer, GLRenderer):  # which takes as long for depth as for color
+        depth = observed.depth.repeat(factor, 1).repeat(factor, 2)
+        rgb = np.stack([recorder.renderer.color(taken.poses.at(t)) for t in range(len(taken))])
+    else:
+        depth, rgb = np.stack([taken.frame(t).depth for t in range(len(taken))]), None
+    return replace(observed, demo=taken, depth=depth, owner=None, rgb=rgb)
 
 
 def _begin_in_color(rollout: Rollout, scene: SceneSettings) -> EpisodeRecorder:
     """The scene of a rollout; without color where there is no OpenGL."""
     try:
         colored = scene.model_copy(update={"renderer": "gl", "rgb": True})
-        return TaskSimulator(rollout.task, colored).begin(rollout.seed)
+        simulator = TaskSimulator(rollout.task, colored)
+        quality = simulator.simulation.scene.model.vis.quality
+        quality.shadowsize, quality.offsamples = _SHADOW_PX, 0
+        return simulator.begin(rollout.seed)
     except MissingLibraryError:
         return TaskSimulator(rollout.task, scene).begin(rollout.seed)

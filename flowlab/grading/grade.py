@@ -24,6 +24,7 @@ from flowlab.grading.origin import Origin, origin_of
 from flowlab.grading.tapvid import MetricSettings
 from flowlab.recordings.recording import RecordingSettings, open_recording
 from flowlab.records import Clip
+from flowlab.text import counted
 from flowlab.tracking.base import Tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.labeling import label_clip
@@ -188,8 +189,8 @@ def _check_same(recording: Path, clip: Clip, truth: GroundTruth) -> None:
     """Refuse truth that cannot be of these pictures."""
     if len(truth.tracks_cam) != len(clip):
         raise DataError(
-            f"{recording / ground_truth.FILE_NAME}: 'tracks_cam' has {len(truth.tracks_cam)} frames, and the "
-            f"recording {len(clip)}; give the truth of every frame, or take out the frames without"
+            f"{recording / ground_truth.FILE_NAME}: 'tracks_cam' has {counted(len(truth.tracks_cam), 'frame')}, and "
+            f"the recording {len(clip)}; give the truth of every frame, or take out the frames without"
         )
     outside = (truth.query_px < -0.5) | (truth.query_px > np.array([clip.camera.width, clip.camera.height]) - 0.5)
     if outside.any():

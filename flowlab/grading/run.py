@@ -13,6 +13,7 @@ from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_tracker
 from flowlab.grading.ground_truth import find_with_truth
 from flowlab.grading.origin import seeds_in_words, sizes_in_words
 from flowlab.sim.loading import load_mujoco
+from flowlab.text import counted
 from flowlab.tracking.base import Tracker, make_tracker
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.lifting import LiftSettings
@@ -48,7 +49,7 @@ class GradingReport:
             sensors.append("sensor of own recordings not stated")
         return (
             f"{len(rows)} recording{'s' if len(rows) > 1 else ''}" + (f" ({seeds})" if seeds else ""),
-            f"{frames} frames, {queries} query points",
+            f"{counted(frames, 'frame')}, {queries} query points",
             *sensors,
             sizes_in_words([row.size for row in rows]),
         )
@@ -125,7 +126,7 @@ def grade(
     folders = list({folder.resolve(): folder for folder in folders}.values())
 
     def tell(row: RecordingGrade) -> None:
-        on_progress(f"{row.recording}: {row.frames} frames in {row.cpu_s:.1f} s of CPU time")
+        on_progress(f"{row.recording}: {counted(row.frames, 'frame')} in {row.cpu_s:.1f} s of CPU time")
 
     results = []
     for tracker in made:

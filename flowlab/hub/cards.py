@@ -9,6 +9,7 @@ from flowlab.data.mixture import dataset_shares
 from flowlab.hub.names import HubName
 from flowlab.hub.repo_layout import PICTURE
 from flowlab.policies.checkpoint import TrainedPolicy
+from flowlab.storage.card import without_mark
 from flowlab.storage.dataset import Dataset
 from flowlab.text import markdown, one_line
 
@@ -57,7 +58,7 @@ def dataset_page(name: HubName, dataset: Dataset, card: str, *, picture: bool) -
         "size_categories": [next((size for most, size in _SIZES if frames < most), "n>10M")],
         "viewer": False,  # it shows tables only
     }
-    rest = card.partition("---\n")[2].partition("---\n")[2].partition("\n")[2].lstrip()
+    rest = without_mark(card).partition("---\n")[2].partition("---\n")[2].partition("\n")[2].lstrip()
     return _front(head) + _filled(_DATASET, name, about.license, picture, rest=rest)
 
 

@@ -15,6 +15,7 @@ from flowlab.hub.names import PREFIX, HubName, Kind
 from flowlab.hub.published_dataset import check_counted, check_sound, finish_dataset, pulled_from
 from flowlab.hub.published_policy import finish_policy, policy_pulled_from
 from flowlab.hub.repo_layout import BOOKS, FETCHED, SHARDS, matches, wanted_files
+from flowlab.text import counted
 from flowlab.user_cache import user_cache
 
 _HELD_BY_THE_LIBRARY = ".cache"
@@ -64,7 +65,7 @@ def pull(
     wanted = wanted_files(state.sizes, found, hub.url(name, found))
     if _is_there(out, pinned, found):
         return Pulled(found, pinned, out, len(wanted), 0)
-    report(f"pulling {found} {pinned}: {len(wanted):,} files, {sum(wanted.values()) / 1e6:,.1f} MB")
+    report(f"pulling {found} {pinned}: {counted(len(wanted), 'file')}, {sum(wanted.values()) / 1e6:,.1f} MB")
     with _staging(out, pinned, found) as folder:
         if folder is not None:
             _check_room(folder, sum(wanted.values()))

@@ -18,6 +18,7 @@ from flowlab.storage.dataset import Dataset, begin, summarize
 from flowlab.storage.manifest import Manifest
 from flowlab.storage.receipts import Receipt, read_receipts
 from flowlab.storage.repair import forget_damaged
+from flowlab.text import counted
 
 _LOG = logging.getLogger(__name__)
 _SECONDS_BETWEEN_SUMMARIES = 5.0
@@ -97,7 +98,7 @@ def fill_by(
         log.write_text("\n\n".join(f"{f.unit.name}\n{f.failure}" for f in failures))
         last = failures[0].failure.strip().split("\n")[-1]
         raise UnfinishedError(
-            f"{len(failures)} units failed, the first ({failures[0].unit.name}) with: {last}. "
+            f"{counted(len(failures), 'unit')} failed, the first ({failures[0].unit.name}) with: {last}. "
             f"All are in {log}; the same command tries them again"
         )
     return dataset

@@ -21,6 +21,7 @@ from flowlab.recordings.parsing import parse_recording
 from flowlab.recordings.preview import RecordingPreview, preview_recording
 from flowlab.recordings.recording import Recording
 from flowlab.storage.recorded import Recorded
+from flowlab.text import counted
 from flowlab.tracking.base import make_tracker
 
 _TRIAL_FRAMES = 33
@@ -125,7 +126,9 @@ def _measure(recipe: Recipe, one: Recorded) -> CostEstimate:
     frames, seconds = min(len(whole), _TRIAL_FRAMES), 0.0
     for n in (4, frames):  # the first compiles and loads
         seconds = sum(_seconds(recipe, _beginning(whole, n), len(whole)))
-    return CostEstimate(opening + seconds / frames, f"measured on the first {frames} frames of {one.task}/{one.name}")
+    return CostEstimate(
+        opening + seconds / frames, f"measured on the first {counted(frames, 'frame')} of {one.task}/{one.name}"
+    )
 
 
 def _beginning(whole: Recording, n: int) -> Recording:

@@ -25,7 +25,7 @@ from flowlab.errors import DataError, FlowlabError, UsageError
 from flowlab.files import check_inside, remove_leftovers
 from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
 from flowlab.policies.migrations import FORMAT, is_old, migrate_policy, migrate_tensor
-from flowlab.policies.tensor_files import metadata_of, read_tensors, understood, write_tensors
+from flowlab.policies.tensor_files import metadata_of, read_tensors, step_in, understood, write_tensors
 from flowlab.registry import names_from_file
 from flowlab.storage.manifest import differences
 from flowlab.text import shown
@@ -180,7 +180,7 @@ def warn_of_lost_checkpoints(run: Path) -> None:
 def step_of(weights: Path) -> int:
     """Training steps that a checkpoint has seen. Raises :class:`DataError` where it is damaged."""
     with understood(weights, _ADVICE), safetensors.safe_open(weights, "pt") as file:
-        return int(metadata_of(file, str(weights), _ADVICE)["step"])
+        return step_in(metadata_of(file, str(weights), _ADVICE))
 
 
 def count_weights(weights: Path) -> int:

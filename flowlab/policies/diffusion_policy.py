@@ -5,48 +5,17 @@ from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
-from pydantic import model_validator
 from torch import Tensor, nn
 
 from flowlab.data.batches import Batch, ObservationBatch
-from flowlab.data.needs import CloudNeeds, Needs
 from flowlab.data.normalizer import Scaler
-from flowlab.data.training_settings import TrainSettings
 from flowlab.nets.denoiser import make_denoiser
 from flowlab.nets.diffusion import Diffusion, NoiseSampler
 from flowlab.nets.motion import MotionHead, MotionLoss
-from flowlab.nets.settings import DenoiserSettings, DiffusionSettings, EncoderSettings, MotionSettings
+from flowlab.nets.settings import MotionSettings
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
 from flowlab.policies.observation_encoder import ObservationEncoder
-
-
-class DiffusionPolicySettings(TrainSettings):
-    """Settings of a diffusion policy on point clouds."""
-
-    encoder: EncoderSettings = EncoderSettings()
-    action: DenoiserSettings = DenoiserSettings()
-    """The network that denoises actions."""
-    diffusion: DiffusionSettings = DiffusionSettings()
-
-    @property
-    def needs(self) -> Needs:
-        """Point clouds."""
-        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset))
-
-    @property
-    def relative_to_gripper(self) -> bool:
-        """As ``encoder.relative`` says."""
-        return self.encoder.relative
-
-    @property
-    def scales_axes(self) -> bool:
-        """As ``encoder.scale`` says."""
-        return self.encoder.scale == "axes"
-
-    @model_validator(mode="after")
-    def _networks_fit(self) -> "DiffusionPolicySettings":
-        self.action.check_horizon(self.horizon)
-        return self
+from flowlab.policies.settings import DiffusionPolicySettings
 
 
 class DiffusionPolicy(PolicyNetwork):

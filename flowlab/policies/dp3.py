@@ -1,12 +1,7 @@
 """3D Diffusion Policy (Ze et al. 2024): point clouds and state in, actions out."""
 
-from flowlab.policies.diffusion_policy import DiffusionPolicy, DiffusionPolicySettings
-
-
-class DP3Settings(DiffusionPolicySettings):
-    """Settings of 3D Diffusion Policy: those that every diffusion policy on clouds has."""
-
-    policy: str = "dp3"
+from flowlab.policies.diffusion_policy import DiffusionPolicy
+from flowlab.policies.settings import DP3Settings
 
 
 class DP3(DiffusionPolicy):

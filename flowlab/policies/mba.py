@@ -2,35 +2,16 @@
 
 import torch
 from jaxtyping import Float
-from pydantic import model_validator
 from torch import Tensor, nn
 
 from flowlab.data.batches import Batch
-from flowlab.data.needs import CloudNeeds, Needs
 from flowlab.nets.motion import PoseHead
-from flowlab.nets.settings import MotionSettings
 from flowlab.policies.base import PolicySpec
-from flowlab.policies.diffusion_policy import DiffusionPolicySettings, MotionPolicy
+from flowlab.policies.diffusion_policy import MotionPolicy
+from flowlab.policies.settings import MBASettings
 
 _CLIP = 2.0
 """Greatest normalized coordinate of a pose."""
-
-
-class MBASettings(DiffusionPolicySettings):
-    """Settings of Motion Before Action."""
-
-    policy: str = "mba"
-    motion: MotionSettings = MotionSettings()
-
-    @property
-    def needs(self) -> Needs:
-        """Point clouds and, in training, the object's pose."""
-        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset), object_pose=True)
-
-    @model_validator(mode="after")
-    def _motion_fits(self) -> "MBASettings":
-        self.motion.denoiser.check_horizon(self.horizon)
-        return self
 
 
 class MBA(MotionPolicy):

@@ -1,5 +1,6 @@
 """What is known of a training run at a glance."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def run_overview(folder: Path) -> RunOverview:
         DataError: It is no run, or is damaged.
     """
     trained = read_trained(folder)
-    plan = read_run_config(folder) if (folder / RUN).is_file() else None
+    plan = read_run_config(folder) if os.path.lexists(folder / RUN) else None
     weights = checkpoint_files(folder)
     return RunOverview(
         trained=trained,

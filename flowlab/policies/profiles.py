@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, SerializeAsAny, ValidationError
 from flowlab.config import Settings, explain, merge, override, read_named
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import UsageError, unknown_name
+from flowlab.policies.settings import OWN
 from flowlab.registry import POLICIES
 from flowlab.text import shown
 from flowlab.untrusted import parse_yaml
@@ -24,6 +25,9 @@ def settings_class(policy: str, folder: Path | None = None) -> type[TrainSetting
     Raises:
         UsageError: There is no such policy.
     """
+    offered = [plugin for plugin in POLICIES.offers() if plugin.name == policy.replace("_", "-")]
+    if len(offered) == 1 and offered[0].place in OWN:  # without PyTorch, which takes a second
+        return OWN[offered[0].place]
     found: type[TrainSettings] = POLICIES.load(policy, folder).settings_class
     return found
 

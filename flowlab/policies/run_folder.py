@@ -12,7 +12,7 @@ from torch import Tensor
 
 from flowlab.checksums import with_checksum
 from flowlab.config import Settings, later
-from flowlab.data.mixture import Weight
+from flowlab.data.mixture import Count, Weight
 from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers, write_json
 from flowlab.policies.checkpoint import (
@@ -40,13 +40,13 @@ class RunConfig(Settings):
     dataset: Path
     more_datasets: tuple[Path, ...] = ()
     """Where there are several, the others."""
-    steps: int
-    train: tuple[int, ...]
+    steps: Count
+    train: tuple[Count, ...]
     """Episodes trained on, by their position in the :class:`~flowlab.data.replay_buffer.ReplayBuffer`."""
-    held_out: tuple[int, ...]
-    inferred: tuple[int, ...] = ()
-    """Those of all whose actions were inferred."""
+    held_out: tuple[Count, ...]
     """Episodes to validate on."""
+    inferred: tuple[Count, ...] = ()
+    """Those of all whose actions were inferred."""
     threads: int
     device: str
     precision: str
@@ -76,6 +76,14 @@ def read_run_config(folder: Path) -> RunConfig:
     if not path.exists():
         raise DataError(f"{folder}: no run to resume (it has no {RUN}); start one with 'flowlab train DATASET --out'")
     return validated(RunConfig, path, FREE)
+
+
+def check_positions(folder: Path, run: RunConfig, episodes: int) -> None:
+    """Refuse a run that tells of more demonstrations than there are. Raises :class:`DataError`."""
+    if (last := max((*run.train, *run.held_out), default=-1)) >= episodes:
+        raise DataError(
+            f"{folder / RUN}: tells of demonstration {last}, counted from 0, and there are {episodes}; restore it"
+        )
 
 
 def save_resume(folder: Path, step: int, groups: Groups) -> None:

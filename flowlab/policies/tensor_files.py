@@ -20,6 +20,7 @@ from flowlab.untrusted import check_regular, parse_json
 
 _ABOUT = "flowlab"
 """Key under which a file of tensors says what it is."""
+_MOST_STEPS = 1 << 62
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
@@ -47,7 +48,7 @@ def read_tensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[str, 
         with safetensors.safe_open(path, "pt") as file:
             about = metadata_of(file, str(path), advice)
         tensors = load_file(path)
-        about["step"] = int(about["step"])
+        about["step"] = step_in(about)
     if "tensors" in about and _digest(tensors) != about["tensors"]:
         raise DataError(f"{path}: damaged (its content does not match its checksum); {advice}")
     return tensors, about
@@ -67,6 +68,15 @@ def metadata_of(file: Any, where: str, advice: str) -> dict[str, Any]:
     if told.keys() == {_ABOUT}:
         return dict(without_checksum(parse_json(told[_ABOUT], where, advice), where, advice))
     return {"step": told["step"]}
+
+
+def step_in(about: Mapping[str, Any]) -> int:
+    """The step that a file of tensors is of; where it tells none, what :func:`understood` turns into a sentence."""
+    told = about["step"]
+    step = int(told) if isinstance(told, str) or type(told) is int else -1  # a word in files of earlier versions
+    if not 0 <= step < _MOST_STEPS:
+        raise ValueError("no step")
+    return step
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from flowlab.errors import FlowlabError
 from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.image_files import COLOR_SUFFIXES
 from flowlab.recordings.tables import parse_table
-from flowlab.text import cut
+from flowlab.text import counted, cut
 from flowlab.untrusted import parse_json, parse_yaml, read_text
 
 _MOST_READ = 4 << 20
@@ -98,9 +98,11 @@ def _of_text(path: Path, suffix: str) -> Contents:
         table = parse_table(path, text)
     except FlowlabError:
         return Contents(f"text: {cut(repr(text.strip()[:60]))}" if text.strip() else "nothing", words=text[:_HEAD])
-    rows = f"{len(table.values)} rows of {table.values.shape[1]} numbers"
+    rows = f"{counted(len(table.values), 'row')} of {table.values.shape[1]} numbers"
     values = None if table.text else table.values
-    return Contents(f"{len(table.values)} rows of {_some(table.names)}" if table.names else rows, values, table.names)
+    return Contents(
+        f"{counted(len(table.values), 'row')} of {_some(table.names)}" if table.names else rows, values, table.names
+    )
 
 
 def _mapping(text: str, suffix: str) -> Any:

@@ -8,6 +8,7 @@ from flowlab.benchmark.ordering import ALL
 from flowlab.benchmark.statistics import Proportion, mean_limits
 from flowlab.benchmark.success import GroupSuccess
 from flowlab.benchmark.summary import Summary
+from flowlab.text import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,9 @@ def _task_cell(success: Proportion, each: int | None) -> SuccessCell:
 
 def _group_cell(group: GroupSuccess) -> SuccessCell:
     """The mean of a group's tasks."""
-    return SuccessCell(group.task_mean, group.mean_low, group.mean_high, f"{len(group.tasks)} of {group.of} tasks")
+    return SuccessCell(
+        group.task_mean, group.mean_low, group.mean_high, f"{len(group.tasks)} of {counted(group.of, 'task')}"
+    )
 
 
 def _expert_cell(summary: Summary, tasks: Sequence[str], each: int | None) -> SuccessCell | None:
@@ -73,7 +76,7 @@ def _expert_cell(summary: Summary, tasks: Sequence[str], each: int | None) -> Su
     if len(found) == 1:
         return _task_cell(found[0], each)
     low, high = mean_limits(found)
-    return SuccessCell(fmean(s.share for s in found), low, high, f"{len(found)} tasks")
+    return SuccessCell(fmean(s.share for s in found), low, high, f"{counted(len(found), 'task')}")
 
 
 def episodes_each(summary: Summary) -> int | None:

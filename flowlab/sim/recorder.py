@@ -137,10 +137,10 @@ class TaskSimulator:
             self._gl = GLRenderer(sim.scene, sim.camera(), sim.settings)
         return self._gl
 
-    def begin(self, seed: int) -> EpisodeRecorder:
-        """An episode with the layout of ``seed``. It ends when the next begins."""
+    def begin(self, seed: int, moved_m: tuple[float, float] = (0.0, 0.0)) -> EpisodeRecorder:
+        """An episode with the layout of ``seed``, the object moved from there. It ends when the next begins."""
         sim = self.simulation
-        sim.reset(seed)
+        sim.reset(seed, moved_m)
         return EpisodeRecorder(sim, seed, self.renderer(sim.poses()))
 
     def record_expert(self, seed: int, settings: ExpertSettings) -> Rollout:

@@ -1,14 +1,17 @@
 """Whether several datasets say the same of themselves, so that they can be one."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
 from flowlab.errors import DataError
+from flowlab.provenance import Provenance
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import differences
 from flowlab.storage.shard import Shard
-from flowlab.text import cut
+from flowlab.text import counted, cut
 
 ALIKE = ("kind", "world_frame", "camera", "state", "action", "action_limits", "observer", "queries")
 """What datasets must say alike of themselves to be trained on together."""
@@ -51,14 +54,14 @@ def check_trained_together(datasets: Sequence[Dataset]) -> None:
         DataError: They do not fit each other; says in what, with both values.
     """
     check_alike(datasets)
-    _check_rates(datasets)
+    check_rates(datasets)
     for k, other in enumerate(datasets[1:], 1):
         mine = {ref.digest for ref in other.refs}
         for first in datasets[:k]:
             if shared := sum(ref.digest in mine for ref in first.refs):
                 raise DataError(
-                    f"{other.path}: {shared} of its {len(other)} episodes are in {first.path}, too, and would count "
-                    f"twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
+                    f"{other.path}: {shared} of its {counted(len(other), 'episode')} are in {first.path}, too, and "
+                    f"would count twice; 'flowlab merge {first.path} {other.path} --out OUT' keeps each once"
                 )
 
 
@@ -71,17 +74,32 @@ def known_scenes(dataset: Dataset) -> Mapping[tuple[str, int], str]:
     return {key: content[key] for ref in dataset.refs if (key := (ref.task, ref.seed)) in content}
 
 
-def _check_rates(datasets: Sequence[Dataset]) -> None:
-    """Refuse datasets of other rates: a step of an action, and of flow, takes another time in each."""
+def check_rates(datasets: Sequence[Dataset], doing: str = _TRAINING) -> None:
+    """Refuse datasets of other rates: a step of an action, and of flow, takes another time in each.
+
+    Raises:
+        DataError: Any two differ by more than clocks do.
+    """
     timed = [(d, period) for d in datasets if (period := _row_period_s(d)) is not None]
-    for other, period in timed[1:]:
-        first, expected = timed[0]
+    for (first, expected), (other, period) in combinations(timed, 2):
         if not 1 / _RATES_DIFFER < period / expected < _RATES_DIFFER:
             raise DataError(
-                f"{other.path}: cannot be {_TRAINING} {first.path}: time: a step takes {period:.4g} s in "
+                f"{other.path}: cannot be {doing} {first.path}: time: a step takes {period:.4g} s in "
                 f"{other.path}, and {expected:.4g} s in {first.path}; make the quicker one again of fewer frames "
-                "(track-real --set recording.every=3), or train on one of them"
+                "(track-real --set recording.every=3), or take one of them alone"
             )
+
+
+def unsaid_meaning(about: Provenance, paths: Sequence[Path]) -> str:
+    """That datasets which say alike that they are ``about`` may have nothing in common but how many numbers their rows
+    have; empty where they say what these mean."""
+    unsaid = " and ".join(name for name in ("state", "action") if getattr(about, name) is None)
+    if not unsaid:
+        return ""
+    return (
+        f"{paths[0]}: does not say what the numbers of its {unsaid} mean, nor does {', '.join(map(str, paths[1:]))}; "
+        "they are taken to mean the same, since there are as many"
+    )
 
 
 def _row_period_s(dataset: Dataset) -> float | None:

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from flowlab.files import locked, remove_leftovers, write_atomically
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
 from flowlab.storage import stats
-from flowlab.storage.card import dataset_card
+from flowlab.storage.card import CARD, dataset_card
 from flowlab.storage.episodes import EpisodeRef, EpisodeSequence, checked, unit_refs, unit_shard
 from flowlab.storage.manifest import MANIFEST, Manifest, differences
 from flowlab.storage.receipts import RowFormat, check_row_formats, read_receipts
@@ -172,6 +173,16 @@ class Dataset(EpisodeSequence):
         return stats.describe(stats.merge(r.stats for r in self.receipts if r.accepted))
 
     @property
+    def arrays(self) -> frozenset[str]:
+        """Paths of the arrays with anything in them, of all tasks: of the first shard of each that can be read."""
+        first = {r.task: r for r in reversed(self.receipts) if r.accepted}
+        found: set[str] = set()
+        for receipt in first.values():
+            with suppress(DataError):
+                found |= {a.path for a in unit_shard(self.path, receipt).describe() if 0 not in a.shape}
+        return frozenset(found)
+
+    @property
     def fingerprint(self) -> str:
         """Identifies settings and content, however they are spread over shards; a checkpoint names the data it
         was trained on by it."""
@@ -282,5 +293,5 @@ def summaries(dataset: Dataset) -> dict[str, str]:
     return {
         "stats.json": json.dumps(dataset.stats, indent=1) + "\n",
         "rejects.jsonl": "".join(rejects),
-        "README.md": dataset_card(dataset.manifest, dataset.receipts, dataset.stats),
+        CARD: dataset_card(dataset.manifest, dataset.receipts, dataset.stats, dataset.arrays),
     }

@@ -12,7 +12,7 @@ from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.records import Episode
 from flowlab.storage.receipts import Receipt
 from flowlab.storage.shard import REPAIR, Shard, episode_digest
-from flowlab.text import shown
+from flowlab.text import counted, shown
 
 _TASKS_SHOWN = 6
 
@@ -152,8 +152,8 @@ class EpisodeSequence(Sequence[Episode], ABC):
         tasks = ", ".join(f"{task} {n}" for task, n in list(count.items())[:_TASKS_SHOWN])
         more = ", ..." if len(count) > _TASKS_SHOWN else ""
         frames = sum(ref.frames for ref in self.refs)
-        head = f"{type(self).__name__} {str(self.path)!r}: {len(self)} episodes, {frames} frames"
-        return f"{head}, {len(count)} tasks ({tasks}{more})\n  arrays: {self._arrays()}"
+        head = f"{type(self).__name__} {str(self.path)!r}: {counted(len(self), 'episode')}, {counted(frames, 'frame')}"
+        return f"{head}, {counted(len(count), 'task')} ({tasks}{more})\n  arrays: {self._arrays()}"
 
     def _arrays(self) -> str:
         """Names of the arrays that the first episode has, with the shape of a row."""

@@ -9,7 +9,7 @@ from typing import Any
 from flowlab.arguments import check_path
 from flowlab.errors import DataError, UsageError
 from flowlab.provenance import Provenance
-from flowlab.storage.compatibility import check_alike
+from flowlab.storage.compatibility import check_alike, check_rates, unsaid_meaning
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.derived import Part, manifest_of
 from flowlab.storage.receipts import check_row_formats
@@ -55,6 +55,9 @@ def merge(datasets: Iterable[Dataset | Path | str], out: Path | str) -> Dataset:
         if source.reservation:
             _LOG.warning("flowlab: %s", source.reservation)
     check_alike(sources, "merged with", tuple(name for name in Provenance.model_fields if name not in _MAY_DIFFER))
+    check_rates(sources, "merged with")
+    if unsaid := unsaid_meaning(sources[0].provenance, [s.path for s in sources]):
+        _LOG.warning("flowlab: %s", unsaid)
     parts, about = _joined(sources)
     manifest = manifest_of(sources[0].manifest, parts, "merge", {"of": about})
     manifest = manifest.model_copy(

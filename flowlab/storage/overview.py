@@ -43,6 +43,19 @@ class LeftOutFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class ListedEpisode:
+    """An episode by its number."""
+
+    episode: int
+    """Position in the dataset, from 0: what ``flowlab viz --episode`` takes."""
+    task: str
+    seed: int
+    frames: int
+    recording: str
+    """Path of the recording; empty for simulation."""
+
+
+@dataclass(frozen=True, slots=True)
 class DatasetOverview:
     """What a dataset holds and how it was made."""
 
@@ -84,6 +97,15 @@ def task_totals(dataset: Dataset) -> tuple[TaskTotals, ...]:
         accepted, frames = sum(len(r.accepted) for r in mine), sum(sum(r.frames) for r in mine)
         totals.append(TaskTotals(task, accepted, wanted, frames, sum(len(r.rejects) for r in mine)))
     return tuple(totals)
+
+
+def list_episodes(dataset: Dataset) -> tuple[ListedEpisode, ...]:
+    """All episodes in order, with their numbers."""
+    source = {(r.task, r.seed): r.source for r in dataset.manifest.recordings}
+    return tuple(
+        ListedEpisode(k, ref.task, ref.seed, ref.frames, source.get((ref.task, ref.seed), ""))
+        for k, ref in enumerate(dataset.refs)
+    )
 
 
 def stage_totals(dataset: Dataset) -> tuple[StageTotals, ...]:

@@ -1,5 +1,6 @@
 """Pictures of a dataset as rows of one array that stays on disk: read from the shards as they are asked for."""
 
+import math
 import os
 from collections import OrderedDict
 from itertools import accumulate
@@ -9,11 +10,13 @@ import numpy as np
 from jaxtyping import Int
 
 from flowlab.errors import DataError
+from flowlab.limits import MAX_PIXELS
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.episodes import unit_shard
 from flowlab.storage.schema import SCHEMA
 from flowlab.storage.shard import REPAIR, Shard
 from flowlab.storage.stored_array import StoredArray
+from flowlab.text import shown
 
 _OPEN = 16
 """So many shards are open at a time."""
@@ -70,7 +73,12 @@ class StoredPictures:
 
         Earlier versions stored up to 256 of them together.
         """
-        return self._together == 1 or self._together * self[:1].nbytes <= most_bytes
+        return self._together == 1 or self.chunk_bytes <= most_bytes
+
+    @property
+    def chunk_bytes(self) -> int:
+        """So much is in memory at a time, beside what is asked for."""
+        return self._together * math.prod(self.shape[1:]) * self.dtype.itemsize
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": OrderedDict()}
@@ -95,11 +103,14 @@ class StoredPictures:
             raise DataError(f"{where}: '{self._name}' is in some episodes only; take those by 'flowlab subset'")
         array = shard.stored(spec.path)
         colors = (3,) if self._name == "rgb" else ()
-        if array.shape != (sum(receipt.frames), *array.shape[1:3], *colors) or array.dtype != spec.dtype:
+        size = tuple(shard.attributes.camera.get(name) for name in ("height", "width"))
+        if array.shape != (sum(receipt.frames), *size, *colors) or array.dtype != spec.dtype:
             raise DataError(
-                f"{shard.path}/{spec.path}: damaged ({array.dtype} {array.shape} for {sum(receipt.frames)} rows); "
-                f"{REPAIR}"
+                f"{shard.path}/{spec.path}: damaged ({array.dtype} {array.shape} for {sum(receipt.frames)} rows of a "
+                f"camera of {shown(size)}); {REPAIR}"
             )
+        if math.prod(array.shape[1:3]) > MAX_PIXELS:
+            raise DataError(f"{shard.path}/{spec.path}: has pictures of {shown(size)}, at most {MAX_PIXELS:,} are read")
         return shard, array
 
     def _check_alike(self, k: int) -> int:
@@ -114,7 +125,13 @@ class StoredPictures:
 
 
 def kinds_of_pictures(dataset: Dataset) -> tuple[str, ...]:
-    """Which kinds of pictures the first episodes of a dataset have. Raises :class:`DataError` where these are bad."""
+    """Which kinds of pictures the first episodes of a dataset have; none where its shards are gone.
+
+    Raises:
+        DataError: The first shard is bad.
+    """
     first = next(r for r in dataset.receipts if r.accepted)
+    if not (dataset.path / first.shard).exists():
+        return ()
     shard = unit_shard(dataset.path, first)
     return tuple(spec.name for spec in SCHEMA if spec.is_picture and shard.has(spec))

@@ -3,13 +3,12 @@
 import hashlib
 import logging
 import math
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from flowlab.arguments import check_count, check_counts, check_names, check_path
+from flowlab.arguments import check_count, check_counts, check_names, check_path, parse_numbers, position
 from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.derived import manifest_of
@@ -19,7 +18,6 @@ from flowlab.storage.transfer import check_out, choose, write_datasets
 from flowlab.text import cut
 
 _LOG = logging.getLogger(__name__)
-_RANGE = re.compile(r"\s*(-?\d{0,18})\s*(:?)\s*(-?\d{0,18})\s*", re.ASCII)
 
 
 def subset(
@@ -140,31 +138,15 @@ def _drawn(refs: Sequence[EpisodeRef], task: str, share: float, seed: int) -> li
 def _positions(episodes: str | slice | int | Iterable[int], count: int, name: str) -> list[int]:
     """Positions among ``count`` episodes, in order, each once. Raises :class:`UsageError` where one is not there."""
     if isinstance(episodes, str):
-        found = [k for text in episodes.split(",") for k in _range(text, count, name)]
+        found = parse_numbers(episodes, name, count)
     elif isinstance(episodes, slice):
         try:
             found = list(range(count))[episodes]
         except (TypeError, ValueError) as error:
             raise UsageError(f"{name}: {episodes} is no slice of numbers ({error})") from error
     else:
-        found = [_inside(k, count, name) for k in check_counts(episodes, name, None)]
+        found = [position(k, count, name) for k in check_counts(episodes, name, None)]
     return sorted({*found})
-
-
-def _range(text: str, count: int, name: str) -> range:
-    """The positions that ``3``, ``0:50``, ``50:`` or ``-10:`` mean."""
-    match = _RANGE.fullmatch(text)
-    first, colon, last = match.groups() if match else ("", "", "")
-    if (not colon and not first) or "-" in (first, last) or (last and not colon):
-        raise UsageError(f"{name}: found {cut(repr(text))}, expected numbers or ranges from 0, as in 0:50,70")
-    start = _inside(int(first), count, name) if first else 0
-    if not colon:
-        return range(start, start + 1)
-    end = int(last) if last else count
-    stop = end + count if end < 0 else end
-    if stop > count or stop <= start:
-        raise UsageError(f"{name}: {cut(text)} is empty or ends beyond the {count} that there are, counted from 0")
-    return range(start, stop)
 
 
 def _ranges(positions: Sequence[int]) -> str:
@@ -173,9 +155,3 @@ def _ranges(positions: Sequence[int]) -> str:
     starts = [0, *(k + 1 for k in ends)]
     found = [(positions[a], positions[b]) for a, b in zip(starts, ends, strict=False)]
     return ",".join(f"{a}" if a == b else f"{a}:{b + 1}" for a, b in found)
-
-
-def _inside(k: int, count: int, name: str) -> int:
-    if not -count <= k < count:
-        raise UsageError(f"{name}: there is no episode {k}; there are {count} to choose from, counted from 0")
-    return k % count

@@ -22,7 +22,7 @@ from flowlab.records import Entity, Episode, Quality, Queries, Role, Tracks3D
 from flowlab.storage.schema import EPISODE_ENDS, POSES, QUALITY, SCHEMA, SCHEMA_VERSION, SIGHT, ArraySpec
 from flowlab.storage.shard_files import open_files, write_zip
 from flowlab.storage.stored_array import StoredArray, stored_array
-from flowlab.text import shown
+from flowlab.text import counted, shown
 from flowlab.untrusted import parse_json
 
 STEPS_PER_CHUNK = 256
@@ -145,7 +145,9 @@ class Shard:
         """The rows of each episode in the ``data`` arrays."""
         ends = self.array(EPISODE_ENDS).tolist()
         if len(ends) != len(self) or sorted({0, *ends}) != [0, *ends]:
-            raise DataError(f"{self.path}/{EPISODE_ENDS}: damaged ({shown(ends)} for {len(self)} episodes); {REPAIR}")
+            raise DataError(
+                f"{self.path}/{EPISODE_ENDS}: damaged ({shown(ends)} for {counted(len(self), 'episode')}); {REPAIR}"
+            )
         return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
     def episodes(self) -> Iterator[Episode]:

@@ -21,6 +21,8 @@ from flowlab.text import shown
 from flowlab.untrusted import parse_json
 
 _CODECS = ["bytes", "zstd", "crc32c"]
+_ZSTD, _FRAME_HEADER = b"\x28\xb5\x2f\xfd", 6
+"""What a frame begins with, and how long its header is at least."""
 _CHECKSUM = 4
 """Bytes at the end of every chunk."""
 _MOST_CHUNKS = 100_000
@@ -107,8 +109,22 @@ class StoredArray:
         if google_crc32c.value(payload).to_bytes(_CHECKSUM, "little") != checksum:
             raise ValueError("a checksum does not match")
         values = np.empty((self.rows_per_chunk, *(max(1, n) for n in self.shape[1:])), self.dtype)
+        if (holds := _content_size(payload)) != values.nbytes:  # the rest would be whatever was in memory before
+            raise ValueError(f"a chunk holds {holds:,} bytes, expected {values.nbytes:,}")
         decompress(payload, values.view(np.uint8).reshape(-1))
         return values[(slice(None), *(slice(n) for n in self.shape[1:]))]
+
+
+def _content_size(frame: bytes) -> int:
+    """How many bytes a Zstandard frame says that it unpacks to (RFC 8878, 3.1.1.1); -1 where it does not say."""
+    if len(frame) < _FRAME_HEADER or frame[:4] != _ZSTD:
+        return -1
+    kind, single_segment, has_dictionary = frame[4] >> 6, frame[4] >> 5 & 1, frame[4] & 3
+    if has_dictionary or not (kind or single_segment):
+        return -1
+    begin = 5 if single_segment else 6
+    size = int.from_bytes(frame[begin : begin + (1, 2, 4, 8)[kind]], "little")
+    return size + 256 if kind == 1 else size
 
 
 def stored_array(files: ShardFiles, path: str) -> StoredArray:

@@ -10,6 +10,7 @@ from flowlab.checksums import has_sha256
 from flowlab.errors import DataError
 from flowlab.provenance import Provenance
 from flowlab.records import Episode
+from flowlab.storage.card import CARD, says_the_same
 from flowlab.storage.checks import ArrayProblem, episode_problems
 from flowlab.storage.dataset import Dataset, summaries
 from flowlab.storage.manifest import MANIFEST
@@ -18,6 +19,7 @@ from flowlab.storage.schema import EPISODE_ENDS, SCHEMA, SCHEMA_VERSION
 from flowlab.storage.shard import REPAIR, Shard, episode_digest
 from flowlab.storage.stats import differing_stats, summarize
 from flowlab.storage.trainable import row_problems
+from flowlab.text import counted
 from flowlab.untrusted import read_text
 from flowlab.version import __version__
 
@@ -135,6 +137,8 @@ def _check_summaries(dataset: Dataset) -> Iterator[Finding]:
         except DataError as error:
             yield finding_of(place, error)
             continue
+        if name == CARD and says_the_same(found, text, dataset.manifest, dataset.receipts, dataset.stats):
+            continue
         if found != text:
             yield Finding(
                 str(place), "does not say what the receipts say; run the same command again, it writes it anew"
@@ -146,7 +150,9 @@ def _check_shard(dataset: Dataset, receipt: Receipt, shard: Shard, contents: boo
     if shard.attributes.settings_digest != dataset.manifest.settings_digest:
         yield Finding(place, f"made with other settings than {MANIFEST} states; {REPAIR}")
     if len(shard) != len(receipt.accepted):
-        yield Finding(place, f"holds {len(shard)} episodes, its receipt says {len(receipt.accepted)}; {REPAIR}")
+        yield Finding(
+            place, f"holds {counted(len(shard), 'episode')}, its receipt says {len(receipt.accepted)}; {REPAIR}"
+        )
         return
     columns, problems = {}, False
     for spec in shard.specs():

@@ -25,6 +25,7 @@ from flowlab.records import Episode
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.exporters.base import Exporter
 from flowlab.testing.promises import content, require, require_words
+from flowlab.text import counted
 
 MakeExporter = Callable[[], Exporter]
 ReadBack = Callable[[Path], Iterable[Episode]]
@@ -77,7 +78,10 @@ def check_tasks(make: MakeExporter, dataset: Dataset) -> None:
         for task in _tasks(dataset):
             wanted = sum(ref.task == task for ref in dataset.refs)
             count = make().export(dataset, folder / task, task)
-            require(count == wanted, f"of the task '{task}' there are {wanted} episodes, but export() writes {count!r}")
+            require(
+                count == wanted,
+                f"of the task '{task}' there are {counted(wanted, 'episode')}, but export() writes {count!r}",
+            )
         alone = [content(folder / task) for task in _tasks(dataset)]
         require(alone[0] != alone[1], "export() must write the episodes of the task that it is asked for, not others")
     with _place() as folder:
@@ -157,7 +161,10 @@ def check_round_trip(make: MakeExporter, dataset: Dataset, read_back: ReadBack) 
     with _place() as folder:
         make().export(dataset, folder / "out")
         found = list(read_back(folder / "out"))
-        require(len(found) == len(dataset), f"{len(dataset)} episodes must be read back, but these are {len(found)}")
+        require(
+            len(found) == len(dataset),
+            f"{counted(len(dataset), 'episode')} must be read back, but these are {len(found)}",
+        )
         for k, episode in enumerate(found):
             truth = dataset.episode(k)
             for name in ("state", "action", "point_cloud"):

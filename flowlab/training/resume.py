@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from flowlab.data.mixture import describe_mixture
+from flowlab.data.mixture import describe_mixture, without_names
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
 from flowlab.policies.checkpoint import POLICY, RUN, build_policy, check_observer, read_trained
-from flowlab.policies.run_folder import read_resume, read_run_config
+from flowlab.policies.run_folder import check_positions, read_resume, read_run_config
 from flowlab.registry import names_from_file
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.loggers import check_loggers
@@ -60,7 +60,9 @@ def resume_run(
         )
     step, groups = read_resume(folder)
     buffer = load_buffer(source, folder, trained.policy.settings.needs.pictures)
-    if describe_mixture(source.parts, buffer, config.train, config.held_out, config.weights) != trained.mixture:
+    check_positions(folder, config, len(buffer.episodes))
+    found = describe_mixture(source.parts, buffer, config.train, config.held_out, config.weights)
+    if without_names(found) != without_names(trained.mixture):
         raise DataError(
             f"{folder}: its {RUN} and {POLICY} tell of other datasets or weights; restore both from one run"
         )

@@ -17,7 +17,7 @@ from flowlab.data.channels import infer_channels
 from flowlab.data.mixture import check_drawn, check_weights, describe_mixture
 from flowlab.data.normalizer import fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
-from flowlab.data.source import TrainingSource, open_training_source, warn_of_shared_scenes
+from flowlab.data.source import TrainingSource, open_training_source, warn_of_shared_scenes, warn_of_what_is_unsaid
 from flowlab.data.split import split_episodes
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError, UsageError
@@ -115,6 +115,7 @@ def prepare_run(
     places = (data,) if isinstance(data, Path) else data
     weighed = check_weights(weights, len(places))
     source = open_training_source(*places)
+    warn_of_what_is_unsaid(source)
     warn_of_shared_scenes(source.parts)
     buffer = load_buffer(source, out, settings.needs.pictures)
     train, held_out = split_episodes(buffer.episodes, settings.data, buffer.inferred)

@@ -14,6 +14,7 @@ from flowlab.hub.pulling import local_sources
 from flowlab.policies.checkpoint import read_trained, writing_run
 from flowlab.policies.profiles import load_settings
 from flowlab.storage.dataset import Dataset
+from flowlab.text import counted
 from flowlab.training.loggers import check_loggers
 from flowlab.training.metrics import last_metrics
 from flowlab.training.precision import Precision
@@ -219,7 +220,7 @@ def _describe(trainer: Trainer) -> Iterator[str]:
     """What was found and what will be done, before it takes long."""
     spec, planned = trainer.policy.spec, trainer.run
     inferred = len(set(planned.train) & set(planned.inferred))
-    taught = f"{len(planned.train)} demonstrations" + (f" ({inferred} with inferred actions)" if inferred else "")
+    taught = counted(len(planned.train), "demonstration") + (f" ({inferred} with inferred actions)" if inferred else "")
     millions = sum(p.numel() for p in trainer.policy.parameters()) / 1e6
     yield (
         f"{spec.settings.policy}, {millions:.1f} M weights, {planned.steps - trainer.step:,} steps on "

@@ -9,7 +9,8 @@ from flowlab.records import Episode
 from flowlab.viz.orientation import up_from_world
 
 CAMERA = "/world/camera/main"
-DEPTH = f"{CAMERA}/depth"
+DEPTH = "/depth"
+"""Not below the camera: it has fewer pixels than that."""
 RGB = f"{CAMERA}/rgb"
 INFO, CHECKS = "/info", "/checks"
 
@@ -17,8 +18,8 @@ INFO, CHECKS = "/info", "/checks"
 def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Blueprint:
     """The scene large, pictures, a table and plots beside it; ``flow_error`` says whether that is plotted."""
     pictures = [
-        rrb.Spatial2DView(origin=CAMERA, contents=[f"+ {entity}"], name=name)
-        for entity, name, there in [(RGB, "rgb", episode.rgb), (DEPTH, "depth", episode.depth)]
+        rrb.Spatial2DView(origin=origin, contents=[f"+ {entity}"], name=name)
+        for origin, entity, name, there in [(CAMERA, RGB, "rgb", episode.rgb), (DEPTH, DEPTH, "depth", episode.depth)]
         if there is not None
     ]
     texts = [rrb.TextDocumentView(origin=INFO, name="info")]
@@ -32,8 +33,7 @@ def make_blueprint(episode: Episode, *, flow_error: bool = False) -> rrb.Bluepri
         plots.insert(0, _plot(name, ["+ /scalars/quality/**"], legend=True, axis_y=percent))
     if flow_error:
         plots.insert(0, _plot("flow error [mm]", ["+ /scalars/flow_error"], legend=False))
-    # A depth picture under a pinhole would be unprojected into the scene, over the cloud.
-    contents = ["+ /world/**", f"- {DEPTH}/**", f"- {RGB}/**"]
+    contents = ["+ /world/**", f"- {RGB}/**"]
     floor = rr.components.Plane3D(up_from_world(episode.camera)[2], _box_up(episode)[0][2])
     scene = rrb.Spatial3DView(
         contents=contents,

@@ -1,8 +1,7 @@
 """The colors that recordings, stills and videos share: tracks loud, by role or by stated error; clouds quiet."""
 
 import numpy as np
-from jaxtyping import Int, UInt8
-from scipy.spatial import cKDTree
+from jaxtyping import Float, Int, UInt8
 
 from flowlab.records import Episode, Role
 from flowlab.viz.stated_error import sigma_rgb, stated_sigma
@@ -72,12 +71,21 @@ def cloud_role(episode: Episode, t: int) -> Int[np.ndarray, "P"]:
     marks = episode.tracks.xyz_world[t, :count]
     if len(points) == 0 or count < 2:
         return np.full(len(points), UNKNOWN)
-    distance, nearest = cKDTree(marks).query(points)
+    distance, nearest = _nearest(points, marks)
     return np.where(distance <= _reach(episode), episode.query_role[:count][nearest], UNKNOWN)
 
 
 def _reach(episode: Episode) -> float:
     """How far around it [m] a track point speaks for the cloud: twice the spacing of the query points."""
     xyz_world = episode.queries.xyz_world[: episode.queries.count]
-    spacing = cKDTree(xyz_world).query(xyz_world, k=[2])[0]
-    return 2 * float(np.median(spacing))
+    others = np.linalg.norm(xyz_world[:, None] - xyz_world, axis=-1)
+    np.fill_diagonal(others, np.inf)
+    return 2 * float(np.median(others.min(1)))
+
+
+def _nearest(
+    points: Float[np.ndarray, "P 3"], marks: Float[np.ndarray, "M 3"]
+) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+    """How far each point is from the nearest mark [m], and which that is; to import a tree of SciPy takes longer."""
+    nearest = ((marks**2).sum(-1) - 2 * points @ marks.T).argmin(1)
+    return np.linalg.norm(points - marks[nearest], axis=-1), nearest

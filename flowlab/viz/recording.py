@@ -12,14 +12,16 @@ from flowlab.geometry.moving import MOVING_IN_PLAN_M
 from flowlab.geometry.transforms import rotation_from_6d
 from flowlab.records import Episode, FlowPrediction
 from flowlab.text import one_line
-from flowlab.viz.blueprint import CAMERA, CHECKS, DEPTH, INFO, RGB, make_blueprint, scene_size
+from flowlab.viz.blueprint import CHECKS, INFO, make_blueprint, scene_size
 from flowlab.viz.captions import describe, describe_checks
 from flowlab.viz.colors import PREDICTED_RGB, SERIES_RGB, SUCCESS_RGB, cloud_rgb_at
-from flowlab.viz.orientation import world_is_camera_frame
 from flowlab.viz.plan_predictions import PREDICTED_M, PlanPrediction, plan_predictions, prediction_errors
+from flowlab.viz.recorded_pictures import send_camera, send_pictures
 from flowlab.viz.recorded_tracks import send_errors, send_tracks, time_columns
 from flowlab.viz.stated_error import COARSE_M, SIGMA_RGB, is_coarse, stated_sigma
 
+_MOST_CLOUD_POINTS, _FEWEST_CLOUD_POINTS = 80_000, 256
+"""Of all steps together, and of each: what keeps a recording small."""
 _LEGEND = (
     "The bright yellow lines, which end in dots, are where the policy predicted the points to go when it made its last "
     f"plan, step by step; points predicted to stay within {1000 * PREDICTED_M:.0f} mm have none. The flow error is how "
@@ -49,8 +51,8 @@ def write_rrd(
                 _send_cloud,
                 send_tracks,
                 send_errors,
-                _send_camera,
-                _send_pictures,
+                send_camera,
+                send_pictures,
                 _send_object,
                 _send_scalars,
             ):
@@ -87,10 +89,11 @@ def _send_text(recording: rr.RecordingStream, panel: str, text: str) -> None:
 
 
 def _send_cloud(recording: rr.RecordingStream, episode: Episode) -> None:
-    """The cloud of every step."""
+    """The cloud of every step; in long episodes a coarser one, which the first of farthest-point samples are."""
     steps = range(len(episode))
-    points = [episode.point_cloud[t, : episode.point_count[t]] for t in steps]
-    colors = [cloud_rgb_at(episode, t) for t in steps]
+    most = max(_FEWEST_CLOUD_POINTS, _MOST_CLOUD_POINTS // len(episode))
+    points = [episode.point_cloud[t, : min(most, episode.point_count[t])] for t in steps]
+    colors = [cloud_rgb_at(episode, t)[:most] for t in steps]
     columns = rr.Points3D.columns(positions=np.concatenate(points), colors=np.concatenate(colors))
     recording.send_columns("/world/cloud", time_columns(episode), columns.partition([len(p) for p in points]))
     recording.log("/world/cloud", rr.Points3D.from_fields(radii=0.0025 * scene_size(episode)), static=True)
@@ -108,45 +111,6 @@ def _send_predictions(recording: rr.RecordingStream, episode: Episode, plans: Se
     thin, small = 0.0008 * scene_size(episode), 0.0022 * scene_size(episode)
     recording.log("/world/predicted/paths", rr.LineStrips3D.from_fields(radii=thin, colors=PREDICTED_RGB), static=True)
     recording.log("/world/predicted/ends", rr.Points3D.from_fields(radii=small, colors=PREDICTED_RGB), static=True)
-
-
-def _send_camera(recording: rr.RecordingStream, episode: Episode) -> None:
-    """The camera at every step, and which way is up."""
-    camera, T_world_cam = episode.camera, episode.camera.T_world_cam
-    axes = rr.ViewCoordinates.RDF if world_is_camera_frame(camera) else rr.ViewCoordinates.RIGHT_HAND_Z_UP
-    recording.log("/", axes, static=True)
-    if episode.T_world_cam is None:
-        recording.log(CAMERA, rr.Transform3D(translation=T_world_cam[:3, 3], mat3x3=T_world_cam[:3, :3]), static=True)
-    else:
-        T = episode.T_world_cam
-        columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
-        recording.send_columns(CAMERA, time_columns(episode), columns)
-        recording.log("/world/camera_path", rr.LineStrips3D([T[:, :3, 3]], colors=SERIES_RGB[-1]), static=True)
-    pinhole = rr.Pinhole(
-        image_from_camera=camera.K,
-        resolution=[camera.width, camera.height],
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=0.1 * scene_size(episode),
-    )
-    recording.log(CAMERA, pinhole, static=True)
-
-
-def _send_pictures(recording: rr.RecordingStream, episode: Episode) -> None:
-    """Depth and color of every step, whichever there are."""
-    T, resolution = len(episode), {"width": episode.camera.width, "height": episode.camera.height}
-    if episode.depth is not None:
-        depth_mm = np.clip(episode.depth * 1000 + 0.5, 0, 65535).astype(np.uint16)  # half the size of float32
-        known = depth_mm[depth_mm > 0]
-        limits = [0, np.percentile(known, 95) if len(known) else 1]
-        form = rr.components.ImageFormat(**resolution, channel_datatype=rr.ChannelDatatype.U16)
-        style = rr.DepthImage.from_fields(format=form, meter=1000.0, depth_range=limits, colormap="viridis")
-        recording.log(DEPTH, style, static=True)
-        buffers = depth_mm.reshape(T, -1).view(np.uint8)
-        recording.send_columns(DEPTH, time_columns(episode), rr.DepthImage.columns(buffer=buffers))
-    if episode.rgb is not None:
-        form = rr.components.ImageFormat(**resolution, color_model="RGB", channel_datatype=rr.ChannelDatatype.U8)
-        recording.log(RGB, rr.Image.from_fields(format=form), static=True)
-        recording.send_columns(RGB, time_columns(episode), rr.Image.columns(buffer=episode.rgb.reshape(T, -1)))
 
 
 def _send_object(recording: rr.RecordingStream, episode: Episode) -> None:

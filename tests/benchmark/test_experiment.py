@@ -22,6 +22,7 @@ import yaml
 from synthetic import call_cli, files_below
 from trained_runs import NETWORK, header_of, lines_of, make_run, options, policy_of, weights_of
 
+from flowlab.benchmark.experiment import _discard_run
 from flowlab.benchmark.paper import CURVE_TASKS, QUERY_PLACES
 from flowlab.benchmark.recipe import load_experiment
 from flowlab.benchmark.results import read_result, write_result
@@ -382,6 +383,15 @@ def test_runs_that_nobody_keeps_are_gone_once_their_units_are_done(
     assert code == 0, err
     assert without_times(unit(out, UNITS[1])) == without_times(unit(experiment, UNITS[1]))
     assert list((out / "runs").iterdir()) == []
+
+
+def test_a_run_that_somebody_linked_to_stays_and_that_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "out/runs").mkdir(parents=True)
+    (tmp_path / "out/runs/push-fdp").symlink_to(tmp_path / "kept")
+    _discard_run(load_experiment(str(write_recipe(tmp_path, keep_runs=False))), tmp_path / "out", "push-fdp")
+    assert (tmp_path / "kept").is_dir()
+    assert "push-fdp: is a link, so the run it leads to stays" in caplog.text
 
 
 def test_parts_of_an_experiment_are_whole_tasks_and_together_all_of_it(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zarr
 from conftest import Cli
-from synthetic import call_cli, make_manifest
+from synthetic import call_cli, make_dataset, make_episode, make_manifest
 from zarr.storage import ZipStore
 
 import flowlab as package
@@ -226,8 +226,7 @@ def test_failed_units_end_in_exit_code_4_and_nothing_else_is_lost(tmp_path: Path
     result = flowlab(*command, cwd=tmp_path)
     assert result.returncode == 4
     assert (
-        "1 units failed, the first (drawer-open-000000-000001) with: RuntimeError: the tide is too high"
-        in result.stderr
+        "1 unit failed, the first (drawer-open-000000-000001) with: RuntimeError: the tide is too high" in result.stderr
     )
     assert "Traceback" not in result.stderr
     assert "RuntimeError: the tide is too high" in (tmp_path / "d/failures.log").read_text()
@@ -260,3 +259,42 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, flowlab: Cli) -> None:
     plan = json.loads(result.stdout)
     assert (plan["tasks"], plan["episodes_wanted"], plan["episodes_to_do"]) == (1, 4, 4)
     assert list(tmp_path.iterdir()) == []
+
+
+SLOW_TO_LOAD = {"torch", "scipy", "pandas", "open3d", "numba", "mujoco", "metaworld", "trimesh", "sklearn", "pyarrow"}
+"""What costs a third of a second and more to import."""
+AT_ONCE = {
+    "info": ["info", "data"],
+    "validate": ["validate", "data"],
+    "viz of a still": ["viz", "data", "--png", "a.png"],
+    "train without data": ["train", "nothere", "--policy", "fdp", "--out", "run"],
+    "train of an unknown policy": ["train", "data", "--policy", "nope", "--out", "run"],
+    "train with a wrong setting": ["train", "data", "--policy", "fdp", "--out", "run", "--set", "run.steps=-3"],
+    "train for two lengths": [
+        "train",
+        "data",
+        "--policy",
+        "fdp",
+        "--out",
+        "run",
+        "--minutes",
+        "3",
+        "--set",
+        "run.steps=9",
+    ],
+    "train with an unknown logger": ["train", "data", "--policy", "fdp", "--out", "run", "--log", "nope"],
+}
+
+
+@pytest.mark.parametrize("what", AT_ONCE)
+def test_what_should_be_quick_imports_nothing_slow(what: str, tmp_path: Path) -> None:
+    make_dataset(tmp_path / "data", [[make_episode(1)]])
+    slow = SLOW_TO_LOAD - ({"scipy"} if what == "validate" else set())  # which looks for nearest points
+    code = (
+        "import sys; from flowlab.cli import main\n"
+        f"try: main(*{AT_ONCE[what]!r})\n"
+        f"finally: print('slow:', *sorted({slow!r} & set(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.stdout.splitlines()[-1] == "slow:", run.stderr
+    assert (run.returncode == 0) == (not what.startswith("train"))

@@ -57,6 +57,6 @@ def test_an_episode_of_an_earlier_flowlab_was_not_checked(tmp_path: Path, capsys
     old = Path(shutil.copytree(OLD, tmp_path / "old"))
     told = json.loads(call_cli(capsys, "info", old, "--json")[1])["checks"]
     assert told == {"verdicts": dict.fromkeys(map(str, Verdict), 0), "episodes_not_checked": 1, "doubtful": []}
-    assert "checks of recordings: 1 episodes not checked" in call_cli(capsys, "info", old)[1]
-    assert "1 episodes were labeled without checks" in call_cli(capsys, "validate", old)[2]
+    assert "checks of recordings: 1 episode not checked" in call_cli(capsys, "info", old)[1]
+    assert "1 episode was labeled without checks" in call_cli(capsys, "validate", old)[2]
     assert "was not checked" in describe_checks(Dataset(old).episode(0))

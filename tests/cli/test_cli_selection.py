@@ -257,7 +257,7 @@ def test_other_widths_and_taken_simulated_seeds_are_refused(whole: Path, tmp_pat
     ("arguments", "code", "says"),
     [
         (["subset", "W", "--tasks", "pusch", "--out", "d"], 2, "did you mean push?"),
-        (["subset", "W", "--tasks", "", "--out", "d"], 2, "no task in"),
+        (["subset", "W", "--tasks", "", "--out", "d"], 2, "names nothing"),
         (["subset", "W", "--episodes", "10", "--out", "d"], 2, "there is no episode 10; there are 10"),
         (["subset", "W", "--tasks", "push", "--episodes", "0:50", "--out", "d"], 2, "ends beyond the 6 that there are"),
         (["subset", "W", "--episodes", "4:4", "--out", "d"], 2, "is empty"),

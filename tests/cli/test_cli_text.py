@@ -41,7 +41,7 @@ def test_text_on_the_terminal_is_what_it_is(text: str, capsys: pytest.CaptureFix
     console.echo(f"echo {text}")
     console.say(f"say {text}")
     console.print_table(["name", text], [[text, 1]], text)
-    with console.ProgressBar(quiet=False) as bar:
+    with console.ProgressBar() as bar:
         bar.update(1, 1, text, text)
     out, err = capsys.readouterr()
     assert not re.search("[\x1b\u202e\u061c\u200b\ud800]", out + err)

@@ -216,8 +216,8 @@ def test_a_dry_run_names_gaps_bad_frames_and_what_is_missing(
     (folder / "recording.yaml").write_text("".join(line for line in described if "intrinsics" not in line))
     code, output, errors = call_cli(capsys, "track-real", tmp_path, "--dry-run", "--estimate", *SMALL)
     assert code == 3
-    assert "1 of 1 recordings cannot be used as they are" in errors
-    assert "1 gaps, the longest of 0.60 s at 1.10 s" in output
+    assert "1 of 1 recording cannot be used as they are" in errors
+    assert "1 gap, the longest of 0.60 s at 1.10 s" in output
     assert "depth/000007.png" in output
     assert f"problem      {folder}" in output
     assert "intrinsics" in output

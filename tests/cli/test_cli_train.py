@@ -105,7 +105,9 @@ def test_a_program_reads_the_same_as_json(rolls: Path, tmp_path: Path, capsys: C
 
 def test_minutes_are_kept_to(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     """Also against a number of steps in the profile; and the learning rate has fallen by then."""
-    small = "--profile", NETWORK, *options("run.steps=7", "run.checkpoints=2")
+    profile = tmp_path / "seven.yaml"
+    profile.write_text(f"extends: {NETWORK}\nrun: {{steps: 7, checkpoints: 2}}\n")
+    small = "--profile", profile
     train(capsys, rolls, "--policy", "dp3", "--out", tmp_path / "run", *small, "--minutes", "0.03", "--device", "cpu")
     *_, last = lines_of(tmp_path / "run")
     assert 0.6 < last["cpu_s"] / 1.8 < 1.4

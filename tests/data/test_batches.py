@@ -21,7 +21,7 @@ from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.data.window_sampler import WindowIndex, WindowSampler, index_windows
 from flowlab.errors import DataError, UsageError
-from flowlab.policies.fdp import FDPSettings
+from flowlab.policies.settings import FDPSettings
 from flowlab.records import Role
 
 HISTORY, HORIZON = 2, 8

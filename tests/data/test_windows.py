@@ -1,16 +1,19 @@
 """Windows for anybody's own training hold what the episodes say, whoever reads them."""
 
+import json
 import pickle
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numcodecs.zstd import compress
 from synthetic import LOOKING_DOWN, assert_same, make_dataset, make_episode, make_provenance, with_quality
 from thoroughness import examples
 from torch.utils.data import DataLoader
@@ -340,6 +343,53 @@ def test_damaged_pictures_are_one_sentence_and_never_black(tmp_path: Path) -> No
     write_zip(shard, {**files, "data/rgb/c/0/0/0/0": bytes(chunk)})  # whose own checksum is right
     with pytest.raises(DataError, match=r"data/rgb: damaged \(a checksum does not match\)"):
         pickle.loads(pickle.dumps(windows))[0]
+
+
+def _lying(files: dict[str, bytes], case: str) -> None:
+    """Change pictures of four rows of 12 x 16; checksums stay true."""
+    about, chunk = json.loads(files["data/rgb/zarr.json"]), "data/rgb/c/0/0/0/0"
+    grid = about["chunk_grid"]["configuration"]
+    row = 12 * 16 * 3
+    if case == "fewer pictures":
+        stored = compress(bytes(3 * row), 3)
+    elif case == "no size":
+        blocks = [(4 * row << 3 | 0b011).to_bytes(3, "little") + b"\7"]  # the last, of one byte repeated
+        stored = b"\x28\xb5\x2f\xfd\x00\x58" + b"".join(blocks)
+    else:
+        about["shape"] = [4, *{"huge": (100_000, 100_000), "wide": (12, 32)}[case], 3]
+        grid["chunk_shape"] = [1, *about["shape"][1:]]
+        stored = compress(bytes(12 * 32 * 3), 3)
+    files[chunk] = stored + google_crc32c.value(stored).to_bytes(4, "little")
+    files["data/rgb/zarr.json"] = json.dumps(about).encode()
+
+
+LIES = {
+    "fewer pictures": "a chunk holds 1,728 bytes, expected 2,304",
+    "no size": "a chunk holds -1 bytes, expected 2,304",
+    "huge": r"damaged \(uint8 \(4, 100000, 100000, 3\) for 4 rows of a camera of \(12, 16\)\)",
+    "wide": "for 4 rows of a camera of",
+}
+
+
+@pytest.mark.parametrize("case", LIES)
+def test_shards_that_lie_about_their_pictures_are_refused_before_memory_is_taken(case: str, tmp_path: Path) -> None:
+    make_dataset(tmp_path / "d", [[with_pictures(make_episode(0, steps=4))]])
+    Windows(tmp_path / "d", {"rgb": [0]})  # what is no picture is decoded, and read no more
+    shard = next((tmp_path / "d/shards").iterdir())
+    with zipfile.ZipFile(shard) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    _lying(files, case)
+    write_zip(shard, files)
+    with pytest.raises(DataError, match=LIES[case]):
+        Windows(tmp_path / "d", {"rgb": [0]})[0]
+
+
+def test_chunks_too_large_to_be_read_for_a_picture_are_left_to_be_decoded(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(window_pictures, "MAX_LOADED_BYTES", 1000)
+    with pytest.raises(DataError, match="are read for one picture; give pictures='decoded'"):
+        Windows(data, {"rgb": [0]}, pictures="stored")
 
 
 @pytest.mark.parametrize("index", [slice(2, 4), "a", 1.5, [0, 1], None])

@@ -16,7 +16,7 @@ def extract(flowlab: Cli, folder: Path, *options: str) -> str:
 def test_the_stage_keeps_what_is_in_view(flowlab: Cli, tmp_path: Path) -> None:
     output = extract(flowlab, tmp_path)
     assert "in_view:InView" in output
-    assert "1 episodes" in output
+    assert "1 episode," in output
     assert (tmp_path / "data" / "stats.json").exists()
 
 

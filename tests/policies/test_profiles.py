@@ -12,9 +12,10 @@ from flowlab.config import Settings
 from flowlab.data.needs import Needs
 from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.errors import UsageError
-from flowlab.policies.fdp import FDPSettings
 from flowlab.policies.migrations import migrate_policy
 from flowlab.policies.profiles import load_settings, settings_class
+from flowlab.policies.settings import OWN, FDPSettings
+from flowlab.registry import POLICIES as REGISTRY
 
 PROFILES = Path(__file__).parents[2] / "pipelines/train"
 POLICIES = ["fdp", "dp3", "mba"]
@@ -278,3 +279,8 @@ def test_policies_on_pictures_are_not_trained_on_moved_scenes() -> None:
     with pytest.raises(UsageError, match=r"batch.shift_m is 0.1 and batch.turn_deg 20.0, and x is trained on pictures"):
         Pictures(policy="x")
     Pictures(policy="x", batch=BatchSettings(shift_m=0, turn_deg=0))
+
+
+def test_settings_that_are_known_without_a_policy_are_those_of_the_policy() -> None:
+    assert {place: REGISTRY.load(place).settings_class for place in OWN} == OWN
+    assert {*OWN} == {plugin.place for plugin in REGISTRY.offers() if plugin.package.startswith("flowlab ")}

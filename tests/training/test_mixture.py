@@ -1,6 +1,7 @@
 """Training from several datasets: each with its share, all of one kind, and nothing that is held out seen twice."""
 
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,20 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from synthetic import call_cli, make_dataset, make_episode, make_provenance
 from trained_runs import SMALL, lines_of, make_run, options, policy_of, saved_by, small_settings, without_times
 
 import flowlab
+from flowlab.checksums import CHECKSUM, with_checksum
 from flowlab.data import source
 from flowlab.data.mixture import check_weights
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
-from flowlab.errors import UsageError
+from flowlab.errors import DataError, UsageError
 from flowlab.evaluation.held_out import open_held_out
 from flowlab.hub.names import HubName
 from flowlab.hub.published_policy import finish_policy, stage_policy
-from flowlab.policies.checkpoint import load_policy
-from flowlab.policies.run_folder import read_run_config
+from flowlab.policies.checkpoint import FREE, load_policy
+from flowlab.policies.run_folder import check_positions, read_run_config
+from flowlab.policies.tensor_files import write_tensors
 from flowlab.records import Episode
 from flowlab.storage.recorded import Recorded
 from flowlab.training.run import ComputeSettings, prepare_run
@@ -121,6 +125,59 @@ def test_a_policy_of_a_mixture_is_published_with_its_weights_and_without_paths(
     code, out, _ = call_cli(capsys, "info", tmp_path / "pulled")
     assert code == 0
     assert "a: 0.5 of the windows, from 5 demonstrations (1 held out); weight 5" in out
+
+
+def test_a_dataset_that_was_pulled_again_is_the_same(
+    data: tuple[Path, ...], unbroken: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    run = shutil.copytree(unbroken, tmp_path / "run")
+    local = marked(tmp_path / "b", 1, [30, 21, 25], first=2)  # the same content, from nowhere
+    moved = json.loads((run / "run.json").read_text())
+    moved["more_datasets"][0] = str(local)
+    (run / "run.json").write_text(json.dumps(moved))
+    code, _, err = call_cli(capsys, "train", run, "--resume")
+    assert code == 0, err
+
+
+def _rewritten(run: Path, name: str, **changes: Any) -> None:
+    """A file of a run as a stranger may give it: with a checksum that is right."""
+    values = {k: v for k, v in json.loads((run / name).read_text()).items() if k != CHECKSUM}
+    (run / name).write_text(json.dumps(with_checksum(values | changes, FREE if name == "run.json" else ())))
+
+
+def test_runs_of_strangers_are_told_in_one_sentence(unbroken: Path, tmp_path: Path, capsys: Capture) -> None:
+    mixture = policy_of(unbroken)["mixture"]
+    wrong: list[tuple[str, dict[str, Any], str]] = [
+        ("run.json", {"steps": -5}, "steps: "),
+        ("run.json", {"train": [-1]}, "train.0: "),
+        ("policy.json", {"mixture": [mixture[0] | {"demonstrations": -3}]}, "mixture.0.demonstrations: "),
+        ("policy.json", {"mixture": [mixture[0] | {"held_out": 10**400}]}, "mixture.0.held_out: "),
+    ]
+    for k, (name, changes, said) in enumerate(wrong):
+        run = shutil.copytree(unbroken, tmp_path / f"{k}")
+        _rewritten(run, name, **changes)
+        code, _, err = call_cli(capsys, "info", run)
+        assert (code, err.count("\n")) == (3, 1)
+        assert f"{run / name}: {said}" in err
+    run = shutil.copytree(unbroken, tmp_path / "device")
+    (run / "run.json").unlink()
+    (run / "run.json").symlink_to("/dev/zero")
+    assert "is a device or a pipe" in call_cli(capsys, "info", run)[2]
+    plan = read_run_config(unbroken)
+    with pytest.raises(DataError, match="tells of demonstration 9, counted from 0, and there are 9; restore it"):
+        check_positions(unbroken, plan.model_copy(update={"train": (9,)}), 9)
+
+
+@pytest.mark.parametrize("step", [math.inf, None, [1], -4, 1.5, "x", 10**400])
+def test_weights_that_do_not_tell_their_step_are_one_sentence(
+    step: Any, unbroken: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    run = shutil.copytree(unbroken, tmp_path / "run")
+    write_tensors(run / "checkpoints/step-99999999.safetensors", {"a": torch.zeros(1)}, {"step": step})
+    for command in ("info", "validate"):
+        code, out, err = call_cli(capsys, command, run)
+        assert code in (1, 3)
+        assert "not written by flowlab, or damaged (it does not tell its step)" in out + err
 
 
 # What is refused.
@@ -230,6 +287,34 @@ def test_datasets_whose_rows_do_not_fit_each_other_are_refused(
     for name, (episode, said) in narrow.items():
         make_dataset(tmp_path / name, [[episode]])
         _refused(capsys, a, tmp_path / name, tmp_path, said.format(b=tmp_path / name))
+
+
+def test_merging_is_no_way_around_other_rates_nor_are_three_datasets(
+    data: tuple[Path, ...], tmp_path: Path, capsys: Capture
+) -> None:
+    for k, seconds in enumerate((0.0125 * 1.04, 0.0125 / 1.04, 0.0125 / 3)):  # two near to a, and not to each other
+        made = replace(make_episode(50 + k, steps=20), time_s=np.arange(20) * seconds)
+        make_dataset(tmp_path / f"{k}", [[made]])
+    near, other, quick = (tmp_path / f"{k}" for k in range(3))
+    with pytest.raises(DataError, match=f"{other}: cannot be trained on together with {near}: time: a step takes"):
+        open_training_source(data[0], near, other)
+    code, _, err = call_cli(capsys, "merge", data[0], quick, "--out", tmp_path / "merged")
+    assert (code, (tmp_path / "merged").exists()) == (3, False)
+    assert f"{quick}: cannot be merged with {data[0]}: time: a step takes 0.004167 s in" in err
+
+
+def test_that_nothing_says_what_numbers_mean_is_said(
+    data: tuple[Path, ...], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    said = "does not say what the numbers of its {} mean, nor does {}; they are taken to mean the same"
+    chosen, compute = small_settings("dp3"), ComputeSettings(device="cpu")
+    prepare_run(data[:2], tmp_path / "run", chosen, compute)
+    assert f"{data[0]}: {said.format('state and action', data[1])}" in caplog.text
+    about = make_provenance(state=[HAND])
+    told = [marked(tmp_path / n, 0, [20, 20], first=9 * k, provenance=about) for k, n in enumerate("ab")]
+    caplog.clear()
+    flowlab.merge(told, tmp_path / "merged")
+    assert f"{told[0]}: {said.format('action', told[1])}" in caplog.text
 
 
 def test_rates_as_near_as_those_of_two_clocks_and_other_trackers_are_fine(

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
@@ -92,17 +93,24 @@ def real() -> Episode:
     return make_filmed_episode()
 
 
-def columns(path: Path, blueprint: bool = False) -> dict[tuple[str, str], list[Any]]:
-    """The rows of every column of a recording or its blueprint, by entity and component."""
+def columns(path: Path, blueprint: bool = False, only: str = "") -> dict[tuple[str, str], list[Any]]:
+    """The rows of every column of a recording or its blueprint, by entity and component; of some entities ``only``."""
     reader = RrdReader(path)
     store = (reader.blueprints() if blueprint else reader.recordings())[0]
     found = {}
     for chunk in reader.stream(store=store).to_chunks():
+        if not chunk.entity_path.startswith(only):
+            continue
         batch = chunk.to_record_batch()
         for name in batch.schema.names:
             if name not in ("rerun.controls.RowId", "blueprint", "log_time", "RecordingInfo:start_time"):
                 found[chunk.entity_path, name] = batch.column(name).to_pylist()
     return found
+
+
+def pictures(found: dict[tuple[str, str], list[Any]], entity: str, kind: str) -> list[np.ndarray]:
+    """The decoded pictures of an entity."""
+    return [cv2.imdecode(np.ravel(blob).astype(np.uint8), -1) for blob in found[entity, f"{kind}:blob"]]
 
 
 def recorded(episode: Episode, tmp_path: Path) -> dict[tuple[str, str], list[Any]]:
@@ -163,15 +171,62 @@ def test_pictures_and_scalars_are_kept(episode: Episode, tmp_path: Path) -> None
     found = recorded(episode, tmp_path)
     assert episode.depth is not None
     assert episode.rgb is not None
-    depth_mm = np.array(found["/world/camera/main/depth", "DepthImage:buffer"], np.uint8).view(np.uint16)
-    np.testing.assert_allclose(depth_mm.reshape(T, 30, 40) / 1000, episode.depth, atol=5.1e-4)
-    np.testing.assert_array_equal(
-        np.reshape(found["/world/camera/main/rgb", "Image:buffer"], episode.rgb.shape), episode.rgb
-    )
+    depth_mm = np.stack(pictures(found, "/depth", "EncodedDepthImage"))
+    np.testing.assert_allclose(depth_mm / 1000, episode.depth, atol=5.1e-4)
+    shown = np.stack(pictures(found, "/world/camera/main/rgb", "EncodedImage"))[..., ::-1]
+    smooth = [
+        cv2.GaussianBlur(np.asarray(x, np.float32), (0, 0), 4) for x in (*shown, *episode.rgb)
+    ]  # JPEG keeps those
+    np.testing.assert_allclose(smooth[:T], smooth[T:], atol=12)
     for kind, values in (("state", episode.state), ("action", episode.action)):
         read = [np.ravel(found[f"/scalars/{kind}/{k}", "Scalars:scalars"]) for k in range(values.shape[1])]
         np.testing.assert_array_equal(np.transpose(read), values)
     np.testing.assert_array_equal(np.ravel(found["/scalars/success", "Scalars:scalars"]), episode.success)
+
+
+def test_pictures_of_a_camera_that_hangs_upside_down_are_upright_and_fit_the_scene(
+    episode: Episode, tmp_path: Path
+) -> None:
+    turned = episode.camera.T_world_cam.copy()
+    turned[:3, :2] *= -1
+    hanging = replace(episode, camera=replace(episode.camera, T_world_cam=turned))
+    found, camera = recorded(hanging, tmp_path), "/world/camera/main"
+    assert hanging.depth is not None
+    np.testing.assert_allclose(
+        pictures(found, "/depth", "EncodedDepthImage")[3] / 1000, hanging.depth[3, ::-1, ::-1], atol=5.1e-4
+    )
+    K, R = (np.reshape(found[camera, c][0], (3, 3)).T for c in ("Pinhole:image_from_camera", "Transform3D:mat3x3"))
+    origin = found[camera, "Transform3D:translation"][0][0]
+    seen = K @ R.T @ ([0.1, 0.2, 0.15] - np.array(origin))  # a point, as the viewer projects it
+    uv, _ = hanging.camera.project(np.array([[0.1, 0.2, 0.15]]))
+    np.testing.assert_allclose(
+        seen[:2] / seen[2], [39, 29] - uv[0], atol=1e-4
+    )  # as in the picture turned by 180 degrees
+
+
+def test_a_long_episode_with_large_pictures_is_a_small_recording(episode: Episode, tmp_path: Path) -> None:
+    steps = np.arange(200) % T
+    v, u = np.mgrid[:480, :640]
+    waves = np.tile((127 + 100 * np.sin(u / 40 + v / 90)).astype(np.uint8), (len(steps), 1, 1))
+    long = replace(
+        episode,
+        **{name: getattr(episode, name)[steps] for name in ("state", "action", "success", "object_pose")},
+        time_s=np.arange(len(steps)) / 64,
+        tracks=replace(
+            episode.tracks, xyz_world=episode.tracks.xyz_world[steps], visible=episode.tracks.visible[steps]
+        ),
+        point_cloud=np.random.default_rng(1).normal(size=(len(steps), 1024, 3)).astype(np.float32),
+        point_count=np.full(len(steps), 1024, np.int32),
+        camera=replace(episode.camera, width=640, height=480),
+        rgb=np.repeat(waves[..., None], 3, -1),
+        depth=waves.astype(np.float32) / 100,
+    )
+    write_rrd(long, tmp_path / "e.rrd", name="long")
+    assert (tmp_path / "e.rrd").stat().st_size < 5e6
+    found = columns(tmp_path / "e.rrd", only="/world/camera/main")
+    assert pictures(found, "/world/camera/main/rgb", "EncodedImage")[0].shape == (240, 320, 3)
+    assert found["/world/camera/main", "Pinhole:resolution"][0][0] == [320, 240]
+    assert found["/world/camera/main/rgb", "step"] == list(range(0, 200, 2))
 
 
 def test_depth_is_not_unprojected_into_the_scene(episode: Episode, tmp_path: Path) -> None:
@@ -181,7 +236,8 @@ def test_depth_is_not_unprojected_into_the_scene(episode: Episode, tmp_path: Pat
     (scene,) = [entity for entity, kind in kinds.items() if kind == "3D"]
     (shown,) = [rows[0] for (e, name), rows in layout.items() if e.startswith(scene) and name.endswith(":query")]
     assert "+ /world/**" in shown
-    assert {"- /world/camera/main/depth/**", "- /world/camera/main/rgb/**"} <= set(shown)
+    assert "- /world/camera/main/rgb/**" in shown
+    assert not [e for e, _ in columns(tmp_path / "e.rrd") if "depth" in e and e.startswith("/world")]
 
 
 def test_views_of_pictures_only_where_there_are_some(episode: Episode, bare: Episode, tmp_path: Path) -> None:
@@ -191,7 +247,7 @@ def test_views_of_pictures_only_where_there_are_some(episode: Episode, bare: Epi
         kinds = [rows[0][0] for (_, name), rows in layout.items() if name.endswith(":class_identifier")]
         assert kinds.count("2D") == expected
         assert kinds.count("TimeSeries") == 2
-        assert len({entity for entity, _ in found if entity.startswith("/world/camera/main/")}) == expected
+        assert len({entity for entity, _ in found if entity in ("/world/camera/main/rgb", "/depth")}) == expected
         assert (("/world/object", "Transform3D:translation") in found) == (e is episode)
 
 

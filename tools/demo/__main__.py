@@ -84,7 +84,7 @@ def learn(commands: Commands, task: str = TASK, training: tuple[str, ...] = ("--
 def label(commands: Commands, task: str = TASK) -> None:
     """What a depth camera would have seen, labeled from the pictures alone, and how good the labels are."""
     at = commands.folder
-    trackers = ("--tracker", "rigid-bodies", "--tracker", "lucas-kanade")
+    trackers = ("--tracker", "rigid-bodies,lucas-kanade")
     commands.run("grade", "grade", "--tasks", task, *trackers, "--out", at / "graded")
     crop = ("--set", f"observer.crop={WORKSPACE}")
     commands.run("label", "track-real", at / "graded" / "recordings", *crop, "--workers", 1, "--out", at / "real")

@@ -12,8 +12,8 @@ from flowlab.cli import cli
 _INTRO = """\
 # Every command
 
-What `flowlab COMMAND --help` says, on one page. It is made by `make reference`. What a command is called in Python,
-exit codes and the rest that all commands have in common are in the
+What `flowlab COMMAND --help` says, on one page. It is made by `make reference`. What a command is called in
+Python, lists, exit codes and the rest that all commands have in common are in the
 [reference](reference.md#from-the-command-line), keys of `--set` in [every setting](settings.md).
 """
 

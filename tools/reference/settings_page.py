@@ -24,7 +24,7 @@ _INTRO = """\
 # Every setting
 
 Each with its type, its default and its meaning, as the code has them; the page is made by `make reference`. A setting
-is changed by `--set KEY=VALUE`, once for each, where KEY is what the table shows and VALUE is YAML:
+is changed by `--set KEY=VALUE`, once for each, where KEY is what the table shows, and VALUE is YAML:
 `--set observer.points=512`, `--set 'encoder.widths=[64, 128]'`. In files of your own ([recipes](stages.md),
 [profiles](training.md)) the same names are keys. What is unknown or does not fit is refused, never ignored.
 """
@@ -75,7 +75,9 @@ def _others() -> Iterator[str]:
         yield _section("", EXPORTERS.load(name), title=name)
     yield "## Files that you write\n"
     yield _section("", Metadata, "See [recordings](recordings.md).", title="recording.yaml")
-    yield _section("", Recipe, "See [stages](stages.md).", title="A recipe of a dataset", without=["stages"])
+    yield _section(
+        "", Recipe, "See [recipes and stages](stages.md).", title="A recipe of a dataset", without={"stages"}
+    )
     yield _section("", ExperimentRecipe, "See [experiments](evaluating.md).", title="A recipe of an experiment")
     yield _section("", PolicyVariant, title="One of its variants")
 

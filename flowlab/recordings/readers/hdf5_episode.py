@@ -16,7 +16,7 @@ from flowlab.recordings.readers.hdf5_process import HDF5Access
 from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.unused_files import some_of
 from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import shown
+from flowlab.text import counted, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def episode_group(data: HDF5Access, path: Path, part: str, episodes: Sequence[st
         return episodes[0]
     if not episodes:
         raise DataError(f"{path}: {data.path.name} has no episode {shown(part)}; name the file alone")
-    found = f"has {len(episodes)} episodes" if not part else f"{data.path.name} has no episode {shown(part)}"
+    found = f"has {counted(len(episodes), 'episode')}" if not part else f"{data.path.name} has no episode {shown(part)}"
     example = data.path / episodes[0]
     raise DataError(f"{path}: {found}; name one of them, as in {example}; there are {some_of(episodes)}")
 

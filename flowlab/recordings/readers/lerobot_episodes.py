@@ -13,7 +13,7 @@ from flowlab.recordings.folder_files import files_below
 from flowlab.recordings.parts import FOLDER_INDEX
 from flowlab.recordings.readers.lerobot_info import LeRobotInfo, read_info
 from flowlab.recordings.readers.lerobot_process import ask
-from flowlab.text import shown
+from flowlab.text import counted, shown
 from flowlab.untrusted import parse_json, read_text
 
 _TASKS = ("meta/tasks.parquet", "meta/tasks.jsonl")
@@ -120,7 +120,7 @@ def _read(folder: Path, state: tuple[Any, ...]) -> Mapping[str, LeRobotEpisode]:
     if info.total_episodes is not None and info.total_episodes != len(found):
         told = _EPISODES[0 if info.is_v3 else 1]
         raise DataError(
-            f"{info.place}: says there are {info.total_episodes:,} episodes, and {told} has {len(found):,}; "
+            f"{info.place}: says there are {counted(info.total_episodes, 'episode')}, and {told} has {len(found):,}; "
             "copy it again"
         )
     return {f"{_CALLED}{k:06d}": found[k] for k in sorted(found)}
@@ -198,7 +198,7 @@ def one_episode(path: Path, folder: Path, part: str) -> LeRobotEpisode:
     if not part and len(episodes) == 1:
         return next(iter(episodes.values()))
     if name not in episodes:
-        found = f"has no episode {shown(part)}" if part else f"has {len(episodes)} episodes"
+        found = f"has no episode {shown(part)}" if part else f"has {counted(len(episodes), 'episode')}"
         first = next(iter(episodes), "none")
         raise DataError(f"{path}: {folder.name} {found}; name one of them, as in {folder / first}" if episodes
                         else f"{path}: {folder.name} has no episodes")  # fmt: skip

@@ -16,6 +16,7 @@ from flowlab.recordings.recording_yaml import FILE_NAME, TRUE_TRACKS, Metadata, 
 from flowlab.recordings.sample_files import load_times
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.writing import write_rgbd_recording
+from flowlab.text import counted
 
 __all__ = ["PlainReader", "write_rgbd_recording"]
 
@@ -80,7 +81,7 @@ def _listed(file: Path, pictures: list[Path]) -> tuple[Float64[np.ndarray, "N"],
     stamps, timing = load_times(file)
     if len(stamps) != len(pictures):
         raise DataError(
-            f"{file}: has {len(stamps)} times for {len(pictures)} pictures in {pictures[0].parent.name}/; "
+            f"{file}: has {len(stamps)} times for {counted(len(pictures), 'picture')} in {pictures[0].parent.name}/; "
             "give one a picture, and depth its own file with 'depth_times' where its pictures are others"
         )
     return stamps, timing

@@ -9,6 +9,7 @@ from flowlab.errors import DataError
 from flowlab.recordings.readers.ros_bag import RosBag
 from flowlab.recordings.readers.ros_messages import CONVERT, is_color, is_depth, is_read
 from flowlab.recordings.recording_yaml import FILE_NAME, Metadata, Topics
+from flowlab.text import counted
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -106,7 +107,7 @@ def _one(bag: RosBag, what: str, topics: Sequence[str], counts: Mapping[str, int
         advice = f"{encodings} is not read: {CONVERT}; else " if unread else ""
         raise DataError(f"{bag.path}: no topic is known as {what}; it has {every}; {advice}name one in {where}: "
                         f"'topics: {{{what}: ...}}'")  # fmt: skip
-    some = ", ".join(f"{t} ({counts[t]} pictures)" for t in topics)
+    some = ", ".join(f"{t} ({counted(counts[t], 'picture')})" for t in topics)
     raise DataError(
         f"{bag.path}: {len(topics)} topics may be {what}: {some}; choose one in {where}: "
         f"'topics: {{{what}: {topics[0]}}}'"

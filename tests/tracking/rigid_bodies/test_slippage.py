@@ -1,6 +1,7 @@
 """What could turn or slide unseen states that it may have: surfaces of closed form, seen by an ideal camera."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,22 @@ def upright_cylinder(ray: np.ndarray) -> np.ndarray:
     flat = ray[..., [0, 2]]
     z = first_root((flat**2).sum(-1), flat @ CENTER[[0, 2]], CENTER[[0, 2]] @ CENTER[[0, 2]] - RADIUS**2)
     return np.where(np.abs(ray[..., 1] * z) < RADIUS, z, np.inf)
+
+
+def large_sphere(ray: np.ndarray) -> np.ndarray:
+    """So large and near that the picture's border cuts it."""
+    center, radius = np.array([-0.2, 0.1, 0.6]), 0.2
+    return first_root((ray**2).sum(-1), ray @ center, center @ center - radius**2)
+
+
+def on_a_table(depth: Depth) -> Depth:
+    """What has nothing below it is a table that slopes toward the camera and reaches the picture's border."""
+
+    def both(ray: np.ndarray) -> np.ndarray:
+        table = (RADIUS + 0.35 * CENTER[2]) / np.maximum(ray[..., 1] + 0.35, 1e-9)
+        return np.where(ray[..., 1] > -0.1, np.minimum(depth(ray), table), depth(ray))
+
+    return both
 
 
 def corner_of_a_box(ray: np.ndarray) -> np.ndarray:
@@ -88,3 +105,42 @@ def test_spots_would_tell(depth: Depth) -> None:
 @pytest.mark.parametrize("noise_m", [0.0, 0.002])
 def test_faces_that_meet_would_tell(noise_m: float) -> None:
     assert slippage_at(clip_of(corner_of_a_box, spotted=False, noise_m=noise_m), *ON_THING).max() < 0.01
+
+
+def test_a_large_thing_that_the_border_cuts_may_have_turned_too() -> None:
+    far = slippage_at(clip_of(large_sphere, spotted=False), (30, 90), (20, 75), *ON_WALL[1:])
+    assert far[:2].min() > 0.02, "it is large, but nothing stands on a sphere"
+    assert far[2] < 0.005
+
+
+def test_a_table_rests_and_what_stands_on_it_in_the_same_color_may_turn() -> None:
+    far = slippage_at(clip_of(on_a_table(upright_cylinder), spotted=False), *ON_THING, (20, 100), (140, 110))
+    assert far[: len(ON_THING)].min() > 0.015
+    assert far[len(ON_THING) :].max() < 0.005
+
+
+def test_at_the_border_of_a_thing_a_point_may_be_of_it() -> None:
+    clip = clip_of(upright_cylinder, spotted=False)
+    left = int(np.flatnonzero(clip.depth[0, 58] < 0.9)[0])
+    rgb = clip.rgb.copy()
+    rgb[:, 40:80, left - 1 : left + 2] = (120, 120, 90)  # as pixels mix what meets in them
+    far = slippage_at(replace(clip, rgb=rgb), (left, 58), (left + 1, 60))
+    assert far.min() > 0.015
+
+
+@pytest.mark.parametrize(("planes", "told"), [(2, False), (3, True)])
+def test_before_a_camera_that_nobody_followed_a_room_may_have_slid_along_itself(planes: int, told: bool) -> None:
+    """Two walls that meet look alike wherever along their edge the camera is; a floor would tell."""
+    normals = np.array([[0.6, 0, -0.8], [-0.6, 0, -0.8], [0, -0.9, -0.436]])[:planes]
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    ray = np.stack([(u - K[0, 2]) / FOCAL, (v - K[1, 2]) / FOCAL, np.ones(u.shape)], -1)
+    depth = []
+    for nearer in np.linspace(0, 0.3, 12):
+        away = np.array([-1.0, -1.0, -0.75])[:planes] - normals[:, 2] * -nearer
+        z = np.stack([d / np.minimum(ray @ n, -1e-9) for n, d in zip(normals, -np.abs(away), strict=True)])
+        depth.append(z.min(0))
+    film = np.array(depth, np.float32)
+    colors = np.full((*film.shape, 3), 128, np.uint8)
+    clip = Clip(colors, film, Camera(WIDTH, HEIGHT, K, np.eye(4)))
+    far = slippage_at(clip, (40, 40), (120, 40))
+    assert (far.max() < 0.01) if told else (far.min() > 0.02)

@@ -22,6 +22,10 @@ class RigidMotion:
         """Where the motion takes points of frame 0 [m]."""
         return xyz_cam @ self.R.swapaxes(1, 2) + self.t[:, None]
 
+    def __matmul__(self, first: "RigidMotion") -> "RigidMotion":
+        """The motion that another one and then this one are."""
+        return RigidMotion(self.R @ first.R, np.einsum("tij,tj->ti", self.R, first.t) + self.t)
+
 
 def fit_rigid(
     a: Float[np.ndarray, "*#batch n 3"],

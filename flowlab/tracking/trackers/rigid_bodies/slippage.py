@@ -9,87 +9,48 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _slipping
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+from flowlab.tracking.trackers.rigid_bodies.patches import JUMP, Patch, patches_beside, resting_planes, surface_patches
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
+from flowlab.tracking.trackers.rigid_bodies.sliding import STEPS, SlidingSurface
 
-_REACH_M, _MOST_TURN = 0.04, 1.2
-"""A surface is moved so far [m], at most by this angle [rad]: far enough to be far off, near enough to be seen."""
 _ALIKE = ((6, 25), (8, 60))
 """Neighbors are of one surface that differ by no more in color and in lightness [counts]: shaded, and with edges."""
-_JUMP = 0.015
-"""Neighbors whose depths differ by more [m, at up to 1 m] are not of one surface; something nearer covers it."""
 _MIN_CELLS, _MIN_INNER, _CELLS, _FRAMES = 6, 12, 200, 8
-_SUPPORT_SHARE = 0.05
-"""A surface of more than this share of the scene that the picture's border cuts is what things stand on: it rests."""
-_NOTICED = 0.1
-"""A cost this much higher is seen."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Surface:
-    """Cells of the first frame that are of one color and one motion, without a jump in depth."""
-
-    cells: Int64[np.ndarray, "n 2"]
-    pixels: Float64[np.ndarray, "n 2"]
-    xyz_cam: Float64[np.ndarray, "n 3"]
-    normals: Float64[np.ndarray, "n 3"]
-    """Of length 0 where not known."""
+_MIDDLE, _DARK = 100, 50
+"""Lightness [counts] that colors are compared at, and below which there is too little to tell them."""
+_NOTICED, _NOTICED_OF_ALL, _CELLS_OF_ALL = 0.1, 0.03, 600
+"""A cost this much higher is seen; of all that stands still, where only what is beside its edges costs more."""
 
 
 def slippage(fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M"]:
     """How far [m] points could move, each with the surface around it, while the clip looked the same but for noise.
 
-    Points of what others stand on are taken to rest: most of a scene could slide along itself, and does not.
+    Points of what others stand on are taken to rest where the camera's motion is known: most of a scene could slide
+    along itself, and does not. Where it is not, all that stands still may have slid before the camera as one.
 
     Args:
         fit: The motions, and which pixels are whose.
         xyz_cam: The points at the first frame [m].
     """
     far = np.zeros(len(xyz_cam))
-    compare = _Comparison.of(fit)
+    compare, resting = _Comparison.of(fit), resting_planes(fit)
+    rest = [Patch.of(fit, np.argwhere(resting))] if resting.any() else []
     for color, lightness in _ALIKE:
-        mine = [s for s in _surfaces(fit, color, lightness) if len(s.cells) >= _MIN_CELLS]
-        if not mine:
-            continue
-        owner = np.repeat(np.arange(len(mine)), [len(s.cells) for s in mine])
-        nearest = owner[cKDTree(np.concatenate([s.xyz_cam for s in mine])).query(xyz_cam)[1]]
-        for k in np.unique(nearest):
-            if not _supports(fit, mine[k].cells):
-                points = nearest == k
-                far[points] = np.maximum(far[points], compare.unnoticed(mine[k], xyz_cam[points]))
+        slides = [p for p in surface_patches(fit, resting, color, lightness) if len(p.cells) >= _MIN_CELLS]
+        for k, points in patches_beside(fit, [*slides, *rest], xyz_cam):
+            if k < len(slides):
+                far[points] = np.maximum(far[points], compare.unnoticed(slides[k], xyz_cam[points]))
+    if fit.pictures.still_is_fitted:
+        owner = fit.assignment.best_motion
+        parts = [Patch.of(fit, cells) for cells in (np.argwhere(owner == 0), np.argwhere(owner > 0)) if len(cells)]
+        for k, points in patches_beside(fit, parts, xyz_cam):
+            if owner[tuple(parts[k].cells[0])] == 0:
+                far[points] = np.maximum(far[points], compare.unnoticed(parts[k], xyz_cam[points], whole=True))
     return far
-
-
-def _surfaces(fit: RigidBodyFit, color: int, lightness: int) -> Iterator[_Surface]:
-    """The surfaces of the first frame, where neighbors differ by no more than so many counts."""
-    pictures, grid, owner = fit.pictures, fit.grid, fit.assignment.best_motion
-    feature = pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.int16)
-    most = np.array([lightness, color, color])
-    label = grid.connect(
-        owner >= 0,
-        _JUMP,
-        lambda near, far: (owner[near] == owner[far]) & (np.abs(feature[near] - feature[far]) <= most).all(-1),
-    )
-    at = np.argwhere(label >= 0)
-    at = at[np.argsort(label[tuple(at.T)], kind="stable")]
-    for cells in np.split(at, np.flatnonzero(np.diff(label[tuple(at.T)])) + 1) if len(at) else ():
-        i, j = cells.T
-        pixels = np.stack([grid.u[i, j], grid.v[i, j]], 1)
-        xyz = pictures.unproject(pixels.astype(float), grid.depth[i, j].astype(float))
-        normals = np.where(grid.edge[i, j, None], 0, pictures.normal[0, pixels[:, 1], pixels[:, 0]] / 127)
-        yield _Surface(cells, pixels.astype(float), xyz, normals)
-
-
-def _supports(fit: RigidBodyFit, cells: np.ndarray) -> bool:
-    """Whether a surface is large and cut by the border of the picture."""
-    last = np.array(fit.grid.valid.shape) - 1
-    cut = (cells == 0).any() or (cells == last).any()
-    return bool(cut and len(cells) > _SUPPORT_SHARE * fit.grid.valid.sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +66,19 @@ class _Comparison:
     def of(cls, fit: RigidBodyFit) -> "_Comparison":
         last = len(fit.pictures) - 1
         frames = np.unique(np.linspace(1, last, min(last, _FRAMES)).round().astype(int))
-        feature, first = fit.pictures.feature[frames], fit.pictures.feature[0].copy()
-        feature[..., 1], first[..., 1] = 0, 0
-        return cls(fit, frames, feature, first)
+        feature = fit.pictures.feature
+        return cls(fit, frames, _unshaded(feature[frames]), _unshaded(feature[0]))
 
-    def unnoticed(self, surface: _Surface, points: Float[np.ndarray, "m 3"]) -> Float64[np.ndarray, "m"]:
-        """How far [m] motions along a surface take points of it, each counted by how little of it would be seen."""
-        some = _inner(surface.cells, self.fit.grid.valid.shape)
-        some = np.random.default_rng(0).permutation(some)[:_CELLS]
+    def unnoticed(
+        self, surface: Patch, points: Float[np.ndarray, "m 3"], whole: bool = False
+    ) -> Float64[np.ndarray, "m"]:
+        """How far [m] motions along a surface take points of it, each counted by how little of it would be seen.
+
+        ``whole``: it is all that stands still. What is seen where its colors meet tells, little as that may be, and it
+        does not hide itself.
+        """
+        some = np.arange(len(surface.cells)) if whole else _inner(surface.cells, self.fit.grid.valid.shape)
+        some = np.random.default_rng(0).permutation(some)[: _CELLS_OF_ALL if whole else _CELLS]
         xyz, pixels = surface.xyz_cam[some], surface.pixels[some].astype(np.float32)
         own = self.fit.motions[self.fit.assignment.best_motion[tuple(surface.cells[0])]]
         slips = list(_slips(self.fit, surface))
@@ -120,10 +86,28 @@ class _Comparison:
         t = np.stack([own.t[self.frames]] + [own.R[self.frames] @ s.t[0] + own.t[self.frames] for s in slips])
         pictures = self.fit.pictures
         rise = _slipping.cost_rise(
-            xyz, _costs.features_at(self.first, pixels), R, t, pictures.depth[self.frames], self.feature, pictures.K
+            xyz,
+            _costs.features_at(self.first, pixels),
+            R,
+            t,
+            pictures.depth[self.frames],
+            self.feature,
+            pictures.K,
+            not whole,
         )
         distance = np.stack([np.linalg.norm(s.apply(points)[0] - points, axis=1) for s in slips])
-        return (distance * np.exp(-((np.maximum(rise, 0) / _NOTICED) ** 4))[:, None]).max(0)
+        hidden = np.exp(-((np.maximum(rise, 0) / (_NOTICED_OF_ALL if whole else _NOTICED)) ** 4)).reshape(-1, STEPS)
+        on_the_way = np.cumprod(hidden, axis=1)  # what is seen half the way is seen
+        return np.asarray((distance * on_the_way.reshape(-1, 1)).max(0))
+
+
+def _unshaded(feature: UInt8[np.ndarray, "*frames H W 4"]) -> UInt8[np.ndarray, "*frames H W 4"]:
+    """Without lightness, and colors as they were at a middle one: what is in the shade has less color, too."""
+    bright = _MIDDLE / np.maximum(feature[..., 1:2].astype(np.float32), _DARK)
+    color = 128 + (feature[..., 2:].astype(np.float32) - 128) * bright
+    return np.concatenate(
+        [feature[..., :1], np.zeros_like(feature[..., :1]), color.round().clip(0, 255).astype(np.uint8)], -1
+    )
 
 
 def _inner(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -134,29 +118,18 @@ def _inner(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return inner if len(inner) >= _MIN_INNER else np.arange(len(cells))
 
 
-def _slips(fit: RigidBodyFit, surface: _Surface) -> Iterator[RigidMotion]:
-    """Motions, of one frame each, that may take a surface along itself, this way and back."""
+def _slips(fit: RigidBodyFit, surface: Patch) -> Iterator[RigidMotion]:
+    """Motions, of one frame each, that may take a surface along itself, this way and back, ever farther."""
     center = surface.xyz_cam.mean(0)
     radius = np.sqrt(((surface.xyz_cam - center) ** 2).sum(1).mean()) + 1e-6
     known = np.linalg.norm(surface.normals, axis=1) > 0.5
     along = _covariance(surface.xyz_cam[known], surface.normals[known], center, radius)
     contour = _covariance(*_contour(fit, surface), center, radius)
-    twists = np.concatenate([np.linalg.eigh(along)[1][:, :3], np.linalg.eigh(along + contour)[1][:, :1]], 1).T
-    for turn, shift in zip(twists[:, :3] / radius, twists[:, 3:], strict=True):
-        speed = np.linalg.norm(np.cross(turn, surface.xyz_cam - center) + shift, axis=1).max()
-        size = min(_REACH_M / max(speed, 1e-9), _MOST_TURN / max(float(np.linalg.norm(turn)), 1e-9))
-        for sign in (size, -size):
-            yield _screw(sign * turn, sign * (shift - np.cross(turn, center)))
-
-
-def _screw(turn: np.ndarray, shift: np.ndarray) -> RigidMotion:
-    """The motion that a turn about the origin [rad] and a shift [m] are at once: the exponential of their twist."""
-    R, angle = cv2.Rodrigues(turn)[0], float(np.linalg.norm(turn))
-    if angle < 1e-9:
-        return RigidMotion(R[None], shift[None])
-    axis = turn / angle
-    t = axis * (axis @ shift) + (np.eye(3) - R) @ np.cross(axis, shift) / angle
-    return RigidMotion(R[None], t[None])
+    twists = [*np.linalg.eigh(along)[1][:, :3].T, np.linalg.eigh(along + contour)[1][:, 0]]
+    sliding = SlidingSurface.of(surface.xyz_cam, surface.normals)
+    for twist in twists:
+        for sign in (1, -1):
+            yield from sliding.slide(sign * twist[:3] / radius, sign * twist[3:], center)
 
 
 def _covariance(xyz: np.ndarray, normals: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
@@ -165,7 +138,7 @@ def _covariance(xyz: np.ndarray, normals: np.ndarray, center: np.ndarray, radius
     return np.asarray(rows.T @ rows / max(len(rows), 1))
 
 
-def _contour(fit: RigidBodyFit, surface: _Surface) -> tuple[np.ndarray, np.ndarray]:
+def _contour(fit: RigidBodyFit, surface: Patch) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 3) of a surface's own border, and what each coordinate shifts them across it in the picture."""
     mask = np.zeros(fit.grid.valid.shape, np.float32)
     mask[tuple(surface.cells.T)] = 1
@@ -185,6 +158,6 @@ def _own_border(fit: RigidBodyFit, cells: np.ndarray, mask: np.ndarray) -> Bool[
     for step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         beside = cells + step
         inside, at = ((beside >= 0) & (beside <= last)).all(1), tuple(np.clip(beside, 0, last).T)
-        covered = (depth[at] > 0) & (depth[at] < z - _JUMP * np.maximum(1, z))
+        covered = (depth[at] > 0) & (depth[at] < z - JUMP * np.maximum(1, z))
         own |= inside & (mask[at] == 0) & ~covered
     return own

@@ -1,14 +1,9 @@
-"""Draws ``docs/images/architecture.svg``: the way of an episode, of a batch and of an action through the rooms.
-
-python tools/draw_architecture.py
-"""
+"""``docs/images/architecture.svg``: the way of an episode, of a batch and of an action through the rooms."""
 
 from collections.abc import Iterator, Sequence
 from itertools import accumulate, pairwise
-from pathlib import Path
 from xml.sax.saxutils import escape
 
-PICTURE = Path(__file__).parents[1] / "docs" / "images" / "architecture.svg"
 Box = tuple[str, str]
 """What happens, and where."""
 
@@ -17,7 +12,7 @@ EPISODE: Sequence[Sequence[Box]] = (
     (("expert acts", "sim/recorder"), ("streams, one clock", "recordings")),
     (("cloud", "perception/observer"),),
     (("query points", "perception/queries"),),
-    (("exact tracks", "sim/tracks"), ("track and lift", "tracking")),
+    (("exact tracks", "sim/exact_tracks"), ("track and lift", "tracking")),
     (("accept or reject", "pipeline/stages"),),
     (("shard, receipt", "storage"),),
 )
@@ -101,7 +96,3 @@ def picture() -> str:
             "</svg>\n",
         ]
     )
-
-
-if __name__ == "__main__":
-    PICTURE.write_text(picture())
