@@ -144,7 +144,7 @@ def test_info_says_what_the_shards_hold(small_dataset: Path, flowlab: Cli) -> No
     info = json.loads(result.stdout)
     assert set(info) == {
         "dataset", "recipe", "flowlab", "fingerprint", "episodes", "frames", "megabytes", "missing", "world_frame",
-        "tasks", "arrays", "stages", "stats", "settings", "provenance",
+        "tasks", "listed", "arrays", "stages", "stats", "settings", "provenance",
     }  # fmt: skip
     ends = {
         p.name: np.asarray(zarr.open_group(ZipStore(p, mode="r"), mode="r")["meta/episode_ends"])
