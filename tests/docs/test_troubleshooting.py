@@ -39,4 +39,4 @@ def test_the_sentence_is_one_that_the_code_says(sentence: str) -> None:
 
 def test_there_are_sentences_and_others_are_noticed() -> None:
     assert len(QUOTED) > 12
-    assert not is_said("the unit of depth is not knwon")
+    assert not is_said("the unit of depth is well known")

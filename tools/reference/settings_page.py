@@ -24,8 +24,8 @@ _INTRO = """\
 # Every setting
 
 Each with its type, its default and its meaning, as the code has them; the page is made by `make reference`. A setting
-is changed by `--set KEY=VALUE`, once for each, where KEY is the heading's prefix and the name in the table, and VALUE
-is YAML: `--set observer.points=512`, `--set 'encoder.widths=[64, 128]'`. In files of your own ([recipes](stages.md),
+is changed by `--set KEY=VALUE`, once for each, where KEY is what the table shows, and VALUE is YAML:
+`--set observer.points=512`, `--set 'encoder.widths=[64, 128]'`. In files of your own ([recipes](stages.md),
 [profiles](training.md)) the same names are keys. What is unknown or does not fit is refused, never ignored.
 """
 
