@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flowlab.cli.console import echo, json_option, print_json, say
+from flowlab.cli.console import echo, json_option, print_json, warn
 from flowlab.cli.heartbeat import PULSE
 from flowlab.cli.paths import PATH
 from flowlab.errors import MissingLibraryError
@@ -53,7 +53,7 @@ def serve(
 
     served = ServedPolicy.load(run, task, device, seed, execute)
     if not _is_here_only(host):
-        say(f"listening on {host}: whoever reaches this port can use the policy; see docs/serving.md for a tunnel")
+        warn(f"listening on {host}: whoever reaches this port can use the policy; see docs/serving.md for a tunnel")
     seconds = ServedEpisodes(served).warm_up()
 
     def listening(url: str) -> None:
@@ -64,8 +64,8 @@ def serve(
             echo(f"serving {run} ({about}; a plan takes {1000 * seconds:.0f} ms) at {url}; Ctrl-C ends it")
 
     PULSE.bars += 1  # it waits for clients, and that needs no telling
-    asyncio.run(_until_stopped(PolicyServer(served, say), host, port, listening))
-    say("stopped")
+    asyncio.run(_until_stopped(PolicyServer(served, warn), host, port, listening))
+    warn("stopped")
 
 
 async def _until_stopped(server: "PolicyServer", host: str, port: int, listening: Callable[[str], None]) -> None:

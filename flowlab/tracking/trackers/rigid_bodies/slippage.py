@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _slipping
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
@@ -44,12 +44,13 @@ def slippage(fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "M 3"]) -> Float64[
         for k, points in patches_beside(fit, [*slides, *rest], xyz_cam):
             if k < len(slides):
                 far[points] = np.maximum(far[points], compare.unnoticed(slides[k], xyz_cam[points]))
-    if fit.pictures.still_is_fitted:
-        owner = fit.assignment.best_motion
-        parts = [Patch.of(fit, cells) for cells in (np.argwhere(owner == 0), np.argwhere(owner > 0)) if len(cells)]
-        for k, points in patches_beside(fit, parts, xyz_cam):
-            if owner[tuple(parts[k].cells[0])] == 0:
-                far[points] = np.maximum(far[points], compare.unnoticed(parts[k], xyz_cam[points], whole=True))
+    still = np.argwhere(fit.assignment.best_motion == 0)
+    if fit.pictures.still_is_fitted and len(still):
+        moving = np.argwhere(fit.assignment.best_motion > 0)
+        room = Patch.of(fit, still)
+        for k, points in patches_beside(fit, [room, *([Patch.of(fit, moving)] if len(moving) else [])], xyz_cam):
+            if k == 0:
+                far[points] = np.maximum(far[points], compare.unnoticed(room, xyz_cam[points], whole=True))
     return far
 
 
@@ -59,15 +60,19 @@ class _Comparison:
 
     fit: RigidBodyFit
     frames: Int64[np.ndarray, "F"]
-    feature: np.ndarray
-    first: np.ndarray
+    depth: Float32[np.ndarray, "F H W"]
+    """[m]."""
+    feature: UInt8[np.ndarray, "F H W 4"]
+    first: UInt8[np.ndarray, "H W 4"]
 
     @classmethod
     def of(cls, fit: RigidBodyFit) -> "_Comparison":
         last = len(fit.pictures) - 1
         frames = np.unique(np.linspace(1, last, min(last, _FRAMES)).round().astype(int))
-        feature = fit.pictures.feature
-        return cls(fit, frames, _unshaded(feature[frames]), _unshaded(feature[0]))
+        pictures = fit.pictures
+        return cls(
+            fit, frames, pictures.depth[frames], _unshaded(pictures.feature[frames]), _unshaded(pictures.feature[0])
+        )
 
     def unnoticed(
         self, surface: Patch, points: Float[np.ndarray, "m 3"], whole: bool = False
@@ -84,17 +89,8 @@ class _Comparison:
         slips = list(_slips(self.fit, surface))
         R = np.stack([own.R[self.frames]] + [own.R[self.frames] @ s.R[0] for s in slips])
         t = np.stack([own.t[self.frames]] + [own.R[self.frames] @ s.t[0] + own.t[self.frames] for s in slips])
-        pictures = self.fit.pictures
-        rise = _slipping.cost_rise(
-            xyz,
-            _costs.features_at(self.first, pixels),
-            R,
-            t,
-            pictures.depth[self.frames],
-            self.feature,
-            pictures.K,
-            not whole,
-        )
+        features, K = _costs.features_at(self.first, pixels), self.fit.pictures.K
+        rise = _slipping.cost_rise(xyz, features, R, t, self.depth, self.feature, K, not whole)
         distance = np.stack([np.linalg.norm(s.apply(points)[0] - points, axis=1) for s in slips])
         hidden = np.exp(-((np.maximum(rise, 0) / (_NOTICED_OF_ALL if whole else _NOTICED)) ** 4)).reshape(-1, STEPS)
         on_the_way = np.cumprod(hidden, axis=1)  # what is seen half the way is seen
