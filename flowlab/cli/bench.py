@@ -10,7 +10,7 @@ from flowlab.cli.console import echo, json_option, print_json, print_tables, qui
 from flowlab.cli.evaluate import echo_report
 from flowlab.cli.paths import PATH
 from flowlab.cli.values import (
-    PluginName,
+    engine_option,
     installed,
     names_option,
     numbers_option,
@@ -18,7 +18,7 @@ from flowlab.cli.values import (
 )
 from flowlab.cli.values import groups as group_names
 from flowlab.errors import UsageError
-from flowlab.registry import ENGINES, POLICIES
+from flowlab.registry import POLICIES
 from flowlab.text import counted
 
 if TYPE_CHECKING:
@@ -38,13 +38,7 @@ if TYPE_CHECKING:
 @click.option("--budget", metavar="TIME", help="Training of each policy, as 10m, 90s or 1.5h  [the recipe's].")
 @click.option("--episodes", type=click.IntRange(min=1), help="Of each seed  [the recipe's].")
 @numbers_option("--seeds", help="Evaluation seeds  [the recipe's].")
-@click.option(
-    "--engine",
-    type=PluginName(ENGINES),
-    default="local",
-    show_default=True,
-    help="Where it is done; 'flowlab plugins' lists engines.",
-)
+@engine_option
 @click.option("--workers", type=click.IntRange(min=1), help="Policies trained at a time  [one for each core].")
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0) of the tasks, for job arrays.")
 @click.option("--device", help="Where to train: cpu, cuda  [a GPU if there is one].")

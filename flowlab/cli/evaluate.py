@@ -7,9 +7,8 @@ import click
 
 from flowlab.cli.console import ProgressBar, echo, json_option, print_json, print_tables, quiet_option
 from flowlab.cli.paths import PATH
-from flowlab.cli.values import PluginName, names_option, numbers_option, tasks_and_groups
+from flowlab.cli.values import engine_option, names_option, numbers_option, tasks_and_groups
 from flowlab.errors import UsageError
-from flowlab.registry import ENGINES
 
 
 @click.command("eval")
@@ -19,13 +18,7 @@ from flowlab.registry import ENGINES
 @names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="[all that every policy was trained on]")
 @click.option("--execute", type=click.IntRange(min=1), help="Steps of a plan to execute: 1 or 8, say  [the policy's].")
 @click.option("--checkpoints", is_flag=True, help="Evaluate every checkpoint of the runs: a learning curve.")
-@click.option(
-    "--engine",
-    type=PluginName(ENGINES),
-    default="local",
-    show_default=True,
-    help="Where it is done; 'flowlab plugins' lists engines.",
-)
+@engine_option
 @click.option("--workers", type=click.IntRange(min=1), help="Processes  [one for each core].")
 @click.option("--device", default="cpu", show_default=True, help="Where plans are made: cpu, cuda, cuda:1.")
 @click.option("--films", type=click.IntRange(min=0), default=0, metavar="N", help="Film N successes and N failures.")

@@ -10,8 +10,7 @@ import click
 
 from flowlab.cli.console import ProgressBar, echo, json_option, print_json, quiet_option, show_extraction
 from flowlab.cli.paths import PATH
-from flowlab.cli.values import PluginName, groups, names_argument, names_option, tasks_and_groups
-from flowlab.registry import ENGINES
+from flowlab.cli.values import engine_option, groups, names_argument, names_option, tasks_and_groups
 
 
 @click.command("extract-sim")
@@ -20,13 +19,7 @@ from flowlab.registry import ENGINES
 @click.option("--episodes", type=click.IntRange(min=1), help="Successful episodes per task [the recipe's: 10].")
 @click.option("--out", type=PATH, required=True, help="Folder of the dataset.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
-@click.option(
-    "--engine",
-    type=PluginName(ENGINES),
-    default="local",
-    show_default=True,
-    help="Where it is done; 'flowlab plugins' lists engines.",
-)
+@engine_option
 @click.option("--recipe", default="metaworld", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: observer.points=512.")
 @click.option("--renderer", type=click.Choice(["zbuffer", "gl"]), help="Short for --set expert.scene.renderer=...")

@@ -16,6 +16,10 @@ class Heartbeat:
     """Remembers what was said last, and when."""
 
     def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """A command begins, and has said nothing yet."""
         self.began = self._last = time.monotonic()
         self._line = ""
         self.bars = 0
@@ -40,7 +44,7 @@ PULSE = Heartbeat()
 @contextmanager
 def beating(context: click.Context, tell: Callable[[str], None]) -> Iterator[None]:
     """While it is open, long silences are broken, unless the command was asked to be quiet."""
-    PULSE.__init__()  # type: ignore[misc]
+    PULSE.begin()
     ended = threading.Event()
 
     def watch() -> None:

@@ -9,9 +9,8 @@ import click
 
 from flowlab.cli.console import ProgressBar, echo, json_option, print_table, quiet_option, show_extraction
 from flowlab.cli.paths import PATH
-from flowlab.cli.values import PluginName
+from flowlab.cli.values import engine_option
 from flowlab.provenance import Channels, Inferred, Provenance
-from flowlab.registry import ENGINES
 from flowlab.text import counted
 
 
@@ -21,13 +20,7 @@ from flowlab.text import counted
 @click.option("--out", type=PATH, required=True, help="Folder of the new dataset.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: max_position_m=0.01.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
-@click.option(
-    "--engine",
-    type=PluginName(ENGINES),
-    default="local",
-    show_default=True,
-    help="Where it is done; 'flowlab plugins' lists engines.",
-)
+@engine_option
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @quiet_option

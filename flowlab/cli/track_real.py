@@ -10,9 +10,9 @@ import click
 
 from flowlab.cli.console import ProgressBar, echo, json_option, print_json, quiet_option, say, show_extraction
 from flowlab.cli.paths import PATH
-from flowlab.cli.values import PluginName
+from flowlab.cli.values import PluginName, engine_option
 from flowlab.errors import DataError, UsageError
-from flowlab.registry import ENGINES, READERS, TRACKERS
+from flowlab.registry import READERS, TRACKERS
 from flowlab.text import counted
 
 if TYPE_CHECKING:
@@ -38,13 +38,7 @@ if TYPE_CHECKING:
 @click.option("--recipe", default="real", show_default=True, help="A recipe's name, or a YAML file.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a setting: queries.points=200.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes [one for each core].")
-@click.option(
-    "--engine",
-    type=PluginName(ENGINES),
-    default="local",
-    show_default=True,
-    help="Where it is done; 'flowlab plugins' lists engines.",
-)
+@engine_option
 @click.option("--shard", default="0/1", metavar="I/N", help="Do part I of N (from 0), for job arrays on one --out.")
 @click.option("--repair", is_flag=True, help="Read all that is there, and make again what is damaged.")
 @click.option("--dry-run", is_flag=True, help="Say what is recognized; write nothing.")

@@ -9,7 +9,7 @@ from click.shell_completion import CompletionItem
 
 from flowlab.arguments import parse_numbers
 from flowlab.errors import UsageError
-from flowlab.registry import Registry
+from flowlab.registry import ENGINES, Registry
 
 _COMMA = re.compile(r"(?<!\\),")
 _Known = Callable[[], Iterable[str]]
@@ -83,6 +83,12 @@ def numbers_option(*declarations: str, **more: Any) -> Any:
     """An option with a list of numbers, which may be repeated."""
     settings: dict[str, Any] = {"type": Numbers(), "multiple": True, "callback": flat, "metavar": "N,A:B,..."} | more
     return click.option(*declarations, **settings)
+
+
+def engine_option(command: Any) -> Any:
+    """``--engine``: where work units are done."""
+    about = "Where it is done; 'flowlab plugins' lists engines."
+    return click.option("--engine", type=PluginName(ENGINES), default="local", show_default=True, help=about)(command)
 
 
 def tasks_and_groups() -> list[str]:
