@@ -91,12 +91,18 @@ class BodyBatch:
             self.points[k], self.features[k] = surface.points[used], surface.features[used]
             self.lightness[k] = self.features[k, :, 1]
 
+    def fit(
+        self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What :meth:`energies` gives, however far the poses are from where the bodies were."""
+        p = self.pictures
+        return _costs.energies(self.points[of], self.features[of], R, s, p.depth[t], p.feature[t], p.K, every)
+
     def energies(
         self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         """Energy and seen share (B', C) of candidate poses (B', C, 3, 3), (B', C, 3) in frame t."""
-        p = self.pictures
-        energy, seen = _costs.energies(self.points[of], self.features[of], R, s, p.depth[t], p.feature[t], p.K, every)
+        energy, seen = self.fit(t, R, s, of, every)
         leap = np.linalg.norm(rotate(R, self.center[of][:, None]) + s - self.last_center[of][:, None], axis=-1)
         return energy + _STEP_PENALTY * (leap > _MAX_STEP_M), seen
 

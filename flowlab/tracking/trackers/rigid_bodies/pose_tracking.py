@@ -8,6 +8,7 @@ from jaxtyping import Bool, Int32
 
 from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch, rotate
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
+from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY, find_again
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid
 
 _POINTS_PER_BODY = 400
@@ -66,6 +67,9 @@ def track_poses(
         lightness = pictures.lightness(t)
         best.try_poses(slice(None), *_evaluate(batch, t, *batch.align(t, best.R, best.s, lightness)), slack=1e-3)
         _borrow_motions(batch, t, best, R[t - 1], s[t - 1], lightness)
+        for k in np.flatnonzero(best.energy > LOST_ENERGY):
+            if found := find_again(batch, t, int(k), seen_R[k], lightness):
+                best.R[k], best.s[k], best.energy[k], best.seen[k] = found
         R[t], s[t], energy = best.R, best.s, best.energy
         good = (best.seen > 0.4) & (energy < 0.5)
         seen_R[good], seen_s[good] = R[t, good], s[t, good]

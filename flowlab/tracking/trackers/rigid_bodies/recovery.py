@@ -1,0 +1,108 @@
+"""A body that was lost, out of the picture or behind something, is looked for wherever something new is seen."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from flowlab.tracking.trackers.rigid_bodies import _costs
+from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
+
+LOST_ENERGY = 0.9
+"""A body of a higher energy is not where it is said to be."""
+_FOUND_ENERGY, _FOUND_SEEN = 0.5, 0.6
+"""What a place must be better than to be a lost body's: most of the body is seen there, and looks as it did."""
+_STEP = 4
+"""Every how many pixels, both ways, a place is tried."""
+_LIKE, _AS_BEFORE = 0.6, 0.35
+"""Costs of color below which a pixel may show the body's middle, and below which it shows what it did at first."""
+_AROUND = 5
+"""Side [px] of the window whose mean color is compared, too: a texture may be finer than the places."""
+_NEARBY_PX = np.array([(x, y, 0.0) for y in range(-2, 3) for x in range(-2, 3)])
+"""Shifts between places."""
+_FIRST_POINTS, _BEST, _REFINED = 50, 8, 4
+"""By how many points places are compared at first, near how many of them others are tried, and how many are refined."""
+
+
+def find_again(
+    batch: BodyBatch, t: int, k: int, R: Float64[np.ndarray, "3 3"], lightness: Float32[np.ndarray, "h w"]
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """A pose in which a lost body explains a frame well, wherever in the picture that is.
+
+    Args:
+        batch: Some bodies.
+        t: The frame.
+        k: Which of them is lost.
+        R: How it was turned when it was last seen.
+        lightness: Of the frame.
+
+    Returns:
+        R, s, the energy and the seen share; None where there is no such pose.
+    """
+    anchor, places = _middle(batch, k), _new_places(batch, t, k)
+    if len(places) == 0:
+        return None
+    every = max(1, batch.points.shape[1] // _FIRST_POINTS)
+    places, _ = _best(batch, t, k, R, places, every, _BEST)
+    nearby = _NEARBY_PX / batch.pictures.K[0, 0] * places[:, None, 2:]
+    places, energy = _best(batch, t, k, R, (places[:, None] + nearby).reshape(-1, 3), every, _REFINED)
+    places, of = places[energy < LOST_ENERGY], np.array([k])
+    if len(places) == 0:
+        return None
+    refined = [batch.align(t, R[None], (x - R @ anchor)[None], lightness, of) for x in places]
+    turns, shifts = (np.concatenate(x) for x in zip(*refined, strict=True))
+    energy, seen = (x[0] for x in batch.fit(t, turns[None], shifts[None], of))
+    i = int(energy.argmin())
+    if energy[i] > _FOUND_ENERGY or seen[i] < _FOUND_SEEN:
+        return None
+    return turns[i], shifts[i], float(energy[i]), float(seen[i])
+
+
+def _best(
+    batch: BodyBatch, t: int, k: int, R: np.ndarray, places: np.ndarray, every: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of places (n, 3) [m] of the middle of body k so many as are best, and their energies."""
+    shifts = places - R @ _middle(batch, k)
+    energy = batch.fit(t, np.tile(R, (1, len(places), 1, 1)), shifts[None], np.array([k]), every)[0][0]
+    best = np.argsort(energy, kind="stable")[:count]
+    return places[best], energy[best]
+
+
+def _new_places(batch: BodyBatch, t: int, k: int) -> Float64[np.ndarray, "n 3"]:
+    """Where [m] frame t shows something colored like the middle of body k that did not stand there at first."""
+    pictures, middle = batch.pictures, _middle(batch, k)
+    first, now = (cv2.blur(pictures.feature[f], (_AROUND, _AROUND))[..., 1:] for f in (0, t))
+    height, width = pictures.depth.shape[1:]
+    v, u = (x.ravel() for x in np.mgrid[0:height:_STEP, 0:width:_STEP])
+    j, i = np.rint(pictures.project(middle)).astype(int).clip(0, [width - 1, height - 1])
+    like = _unlike(now[v, u], first[i, j]) < _LIKE
+    like |= _unlike(pictures.feature[t, v, u, 1:], pictures.feature[0, i, j, 1:]) < _LIKE
+    like &= pictures.depth[t, v, u] > 0
+    u, v = u[like], v[like]
+    xyz = pictures.unproject(np.stack([u, v], -1).astype(float), pictures.depth[t, v, u].astype(float))
+    return xyz[~_stood_there(pictures, t, xyz, pictures.feature[t, v, u, 1:])]
+
+
+def _middle(batch: BodyBatch, k: int) -> Float64[np.ndarray, "3"]:
+    """Of the points by which body k is followed the one [m] nearest to their center."""
+    points = batch.points[k]
+    return np.asarray(points[np.linalg.norm(points - points.mean(0), axis=1).argmin()])
+
+
+def _stood_there(
+    pictures: ClipFeatures, t: int, xyz: Float64[np.ndarray, "n 3"], color: UInt8[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Whether the first frame shows points [m] of frame t in the same color where they would be if they stood still."""
+    height, width = pictures.depth.shape[1:]
+    first = (xyz - pictures.stillness.t[t]) @ pictures.stillness.R[t]
+    uv, z = np.rint(pictures.project(first)).astype(int), first[:, 2]
+    inside = (z > 0.05) & (uv >= 0).all(1) & (uv < [width, height]).all(1)
+    j, i = np.where(inside[:, None], uv, 0).T
+    near = np.abs(pictures.depth[0, i, j] - z) < _costs.SURFACE_TOLERANCE * np.maximum(1, z * z)
+    return inside & near & (_unlike(pictures.feature[0, i, j, 1:], color) < _AS_BEFORE)
+
+
+def _unlike(a: UInt8[np.ndarray, "n 3"], b: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "n"]:
+    """What colors (lightness, a, b) that differ cost, 0 and more."""
+    off = np.abs(a.astype(np.int16) - b).astype(np.float32)
+    return np.asarray(off @ np.array([_costs.L, _costs.A, _costs.B], np.float32))
