@@ -125,6 +125,7 @@ class Bench:
 
 
 def machine() -> dict[str, str]:
+    """Of the commit and the processor, for a result."""
     flags = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
     names = [line.split(": ")[1] for line in flags.splitlines() if line.startswith("model name")]
     kind = next((k for k in ("avx512_bf16", "avx512f", "avx2") if k in flags), platform.machine())

@@ -3,8 +3,8 @@
     python benchmarks/flow_plans.py --out OUT                  # what is not there yet, task by task
     python benchmarks/flow_plans.py --out OUT --print          # tables of what is there
 
-Policies are trained on K demonstrations, one for each task, training seed and kind; then each way of deciding is tried on
-the same layouts with the same weights. A result is kept as OUT/units/NAME.json as it ends: ended early, the same
+Policies are trained on K demonstrations, one for each task, training seed and kind; then each way of deciding is tried
+on the same layouts with the same weights. A result is kept as OUT/units/NAME.json as it ends: ended early, the same
 command does the rest.
 """
 
@@ -168,7 +168,9 @@ class Bench:
             return dict(json.loads(path.read_text()))
         run = self.trained(task, count, kind, seed)
         ref, loaded = find_checkpoint(run), load_policy(run)
-        readout = FlowReadout.fit(iter(self.data(task, count)), np.random.default_rng(seed)) if name in NEED_FLOW else None
+        readout = (
+            FlowReadout.fit(iter(self.data(task, count)), np.random.default_rng(seed)) if name in NEED_FLOW else None
+        )
         way, execute = WAYS[name]
         decider: Any = Decider(Deciding(loaded.policy, readout), way)
         began = time.process_time()
@@ -218,7 +220,10 @@ def _print(units: list[dict[str, Any]]) -> None:
             units_of = {k[2:]: u for k, u in mine.items() if k[:2] == (kind, way)}
             if units_of:
                 of_task = [[u for (t, _), u in units_of.items() if t == task] for task in tasks]
-                cells = [f"{sum(u['sum'] for u in us)} of {sum(u['of'] for u in us)}" for us in [*of_task, [*units_of.values()]]]
+                cells = [
+                    f"{sum(u['sum'] for u in us)} of {sum(u['of'] for u in us)}"
+                    for us in [*of_task, [*units_of.values()]]
+                ]
                 print("|", " | ".join([kind, way, *cells, _p(units_of, base)]), "|")
 
 

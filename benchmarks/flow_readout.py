@@ -56,7 +56,10 @@ class FlowReadout:
         angle[: len(x)] = 0
         c, s, o = np.cos(angle), np.sin(angle), np.zeros_like(angle)
         R = np.stack([np.stack([c, -s, o], 1), np.stack([s, c, o], 1), np.stack([o, o, o + 1], 1)], 1)
-        x, y = np.einsum("nij,nkj->nki", R, np.tile(x, (_COPIES, 1, 1))), np.einsum("nij,nj->ni", R, np.tile(y, (_COPIES, 1)))
+        x, y = (
+            np.einsum("nij,nkj->nki", R, np.tile(x, (_COPIES, 1, 1))),
+            np.einsum("nij,nj->ni", R, np.tile(y, (_COPIES, 1))),
+        )
         chosen = rng.permutation(len(x))[:MOST_ROWS]
         x = x.reshape(len(x), -1)[chosen] / _UNIT_M
         return cls(np.mean(starts, 0), KernelRegression.fit(x, y[chosen], ridge=0.01, sharpness=0.3))
@@ -68,7 +71,12 @@ class FlowReadout:
         point is on the gripper."""
         off = queries - self.start
         near = (np.abs(off[..., :2]).max(2) < _ON_GRIPPER_M) & (off[..., 2] > -_BELOW_M) & (off[..., 2] < _ABOVE_M)
-        hand = np.stack([np.median(f[:, n], 1) if n.any() else np.full((f.shape[0], 3), np.nan) for f, n in zip(flow, near)])
+        hand = np.stack(
+            [
+                np.median(f[:, n], 1) if n.any() else np.full((f.shape[0], 3), np.nan)
+                for f, n in zip(flow, near, strict=True)
+            ]
+        )
         around = np.arange(first, first + count)[:, None] + np.arange(-_BACK, _AHEAD + 1)
         rows = hand[:, around] / _UNIT_M
         return self.regression.predict(rows.reshape(-1, rows.shape[2] * 3)).reshape(len(flow), count, 3)
