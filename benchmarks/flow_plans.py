@@ -114,6 +114,7 @@ def _chosen(plan: ActionPlan, cost: Tensor) -> ActionPlan:
 WAYS: dict[str, tuple[Way, int]] = {
     "as trained": (as_trained, 8),
     "anew every 4": (as_trained, 4),
+    "anew every 2": (as_trained, 2),
     "nearest of 8": (nearest_to_all, 8),
     "agreeing of 8": (agreeing, 8),
     "half flow": (read_off(0.5), 8),
@@ -121,7 +122,7 @@ WAYS: dict[str, tuple[Way, int]] = {
 }
 """How it is decided, and how many steps of a plan are executed."""
 NEED_FLOW = ("agreeing of 8", "half flow", "flow")
-OTHERS = {"dp3": ("as trained", "anew every 4", "nearest of 8"), "auxiliary": ("as trained",)}
+OTHERS = {"dp3": ("as trained", "anew every 4", "anew every 2", "nearest of 8"), "auxiliary": ("as trained",)}
 """Ways of those whose action is not conditioned on flow."""
 
 
