@@ -3,8 +3,8 @@
 The identity is a text of two parts with a ``/`` between them: a digest of the files of the recording, and a digest of
 what is said of it (``recording.yaml`` and the calibration file as they are understood, and the reader). Small files are
 digested whole, of larger ones parts that are evenly spread: no two pictures of a sensor have the same noise, and those
-that are compressed end in a checksum. Numbers in HDF5, Parquet and NumPy's files can change without a change of size, so
-these are digested whole, whatever their size. Times of files are not part of it, for copies have others.
+that are compressed end in a checksum. Numbers in HDF5, Parquet and NumPy's files can change without a change of size,
+so these are digested whole. Times of files are not part of it, for copies have others.
 """
 
 import hashlib
