@@ -95,7 +95,6 @@ def grade(
     from flowlab.grading.run import REPORT
     from flowlab.grading.run import grade as run_grading
     from flowlab.sim.tasks import tasks_named
-    from flowlab.viz.grade_figure import draw_grades
 
     report = run_grading(
         recordings,
@@ -114,6 +113,8 @@ def grade(
         workers=workers,
         on_progress=say,
     )
+    from flowlab.viz.grade_figure import draw_grades
+
     picture = out / "grade.png"
     draw_grades({t.name: t.mean for t in report.trackers}, picture, graded=report.graded, about=report.about)
     if as_json:
