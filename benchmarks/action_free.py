@@ -90,7 +90,7 @@ class Bench:
                 )
             return known
         start = time.process_time()
-        found = about | make() | {"cpu_s": round(time.process_time() - start), **_machine()}
+        found = about | make() | {"cpu_s": round(time.process_time() - start), **machine()}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, found)
         print(name, json.dumps({k: v for k, v in found.items() if k != "solved"}), flush=True)
@@ -124,7 +124,8 @@ class Bench:
         return self.unit(f"policy-{task}-{count}-{way}-{policy}-{seed}", make, about)
 
 
-def _machine() -> dict[str, str]:
+def machine() -> dict[str, str]:
+    """Of the commit and the processor, for a result."""
     flags = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
     names = [line.split(": ")[1] for line in flags.splitlines() if line.startswith("model name")]
     kind = next((k for k in ("avx512_bf16", "avx512f", "avx2") if k in flags), platform.machine())

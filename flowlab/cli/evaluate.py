@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import click
 
 from flowlab.cli.console import ProgressBar, echo, json_option, print_json, print_tables, quiet_option
 from flowlab.cli.paths import PATH
-from flowlab.cli.values import engine_option, names_option, numbers_option, tasks_and_groups
+from flowlab.cli.values import StepsOrAuto, engine_option, names_option, numbers_option, tasks_and_groups
 from flowlab.errors import UsageError
 
 
@@ -16,7 +17,11 @@ from flowlab.errors import UsageError
 @click.option("--episodes", type=click.IntRange(min=1), default=20, show_default=True, help="Of each task and seed.")
 @numbers_option("--seeds", default=["0,1,2"], help="Evaluation seeds  [0,1,2].")
 @names_option("--tasks", "--task", "tasks", known=tasks_and_groups, help="[all that every policy was trained on]")
-@click.option("--execute", type=click.IntRange(min=1), help="Steps of a plan to execute: 1 or 8, say  [the policy's].")
+@click.option(
+    "--execute",
+    type=StepsOrAuto(),
+    help="Steps of a plan to execute: 1 or 8, say; auto tries 20 other layouts of each task  [the policy's].",
+)
 @click.option("--checkpoints", is_flag=True, help="Evaluate every checkpoint of the runs: a learning curve.")
 @engine_option
 @click.option("--workers", type=click.IntRange(min=1), help="Processes  [one for each core].")
@@ -32,7 +37,7 @@ def evaluate(
     episodes: int,
     seeds: tuple[int, ...],
     tasks: tuple[str, ...],
-    execute: int | None,
+    execute: int | Literal["auto"] | None,
     checkpoints: bool,
     engine: str,
     workers: int | None,
@@ -83,7 +88,7 @@ def evaluate(
     if films:
         from flowlab.report.videos import write_videos
 
-        videos = write_videos(runs, results, films, out, execute)
+        videos = write_videos(runs, results, films, out)
     from flowlab.benchmark.summary import summarize
 
     summary = summarize(results)
@@ -97,6 +102,9 @@ def evaluate(
     from flowlab.report.tables import summary_tables
 
     print_tables(summary_tables(summary))
+    for result in results:
+        if result.execution is not None:
+            echo(f"{result.name}: {result.execution}")
     for path in videos:
         echo(f"film: {path}")
     if out is not None:

@@ -63,6 +63,19 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
             self.fail(str(error), param, ctx)
 
 
+class StepsOrAuto(click.IntRange):
+    """A number of steps from 1 on, or ``auto``."""
+
+    name = "steps or auto"
+
+    def __init__(self) -> None:
+        super().__init__(min=1)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, or the word."""
+        return value if value == "auto" else super().convert(value, param, ctx)
+
+
 def flat(ctx: click.Context, param: click.Parameter, values: Iterable[Iterable[Any]]) -> tuple[Any, ...]:
     """The lists of an option that was given several times as one list, each value once."""
     return tuple(dict.fromkeys(value for part in values for value in part))

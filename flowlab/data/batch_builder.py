@@ -64,7 +64,7 @@ class BatchBuilder:
             if self._needs.object_pose
             else np.zeros((*row.shape, 0), np.float32),
         }
-        if rng is not None and (s.batch.shift_m or s.batch.turn_deg):
+        if rng is not None and self._channels.shifts and (s.batch.shift_m or s.batch.turn_deg):
             self._move(arrays, windows, run_of_frame, rng)
         return Batch(
             **{name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()},

@@ -24,6 +24,21 @@ _PROOFS = 3
 """So many motions, and half of those with a track nearby, must have points that move with the gripper."""
 _REACHED_M = 0.02
 """Actions are taken to be positions if, in the median, the gripper is this near to them a step later."""
+_LATER = range(1, 16)
+"""Or if it is where they are so many steps later, as of an arm that lags: along every axis on which it moves, action
+and place rise alike,"""
+_ALIKE, _SLOPES = 0.95, (0.8, 1.25)
+"""with at least this correlation, and this slope,"""
+_LEADS_M = 0.15
+"""and are this near to each other in the median, which places relative to where an episode began are not."""
+_VARIES_M = 0.01
+"""An axis counts where the gripper varies by this along it (one standard deviation); two must."""
+_COMMANDED, _MOST_STEPS = 0.8, 5
+"""Actions are displacements if along every such axis they are correlated by this with the way of up to so many steps,
+and more than with the ways along other axes."""
+_ONE_ARM = 10
+"""Numbers of an action that may be one arm's: a place, six of a rotation, a gripper. Of more, nobody knows what else is
+a place."""
 Triple = tuple[int, int, int]
 
 
@@ -38,6 +53,13 @@ class ChannelSpec(Settings):
     """Of the action: where the gripper is sent to; None where actions are displacements or not known."""
     action_displacement: Triple | None = None
     """Of the action: how far the gripper is to move along the world's axes; None where that is not known."""
+
+    @property
+    def shifts(self) -> bool:
+        """Whether a scene can be shifted with all that is said of it: whoever does not know what an action is cannot
+        say what it would be elsewhere, as of angles of joints."""
+        known = self.action_position is not None or self.action_displacement is not None
+        return known and self.gripper is not None
 
     def turns(self, state_width: int, action_width: int) -> bool:
         """Whether all that has a direction is known, so that a scene can be turned: no quaternions, say.
@@ -69,8 +91,12 @@ def infer_channels(source: TrainingSource, buffer: ReplayBuffer) -> ChannelSpec:
                   "gripper's position; clouds and actions stay in the world", source.path)  # fmt: skip
         return ChannelSpec()
     first = (0, 1, 2)
-    to_positions = buffer.action.shape[1] >= 3 and _actions_are_positions(buffer)
-    return ChannelSpec(gripper=first, state_positions=(first,), action_position=first if to_positions else None)
+    found = ChannelSpec(gripper=first, state_positions=(first,))
+    if not 3 <= buffer.action.shape[1] <= _ONE_ARM:
+        return found
+    if _actions_are_positions(buffer):
+        return found.model_copy(update={"action_position": first})
+    return found.model_copy(update={"action_displacement": first if _actions_are_displacements(buffer) else None})
 
 
 def _as_stated(state: Sequence[Channels], action: Sequence[Channels]) -> ChannelSpec:
@@ -133,8 +159,48 @@ def _off_way(then: np.ndarray, now: np.ndarray, gripper: np.ndarray, way: np.nda
 
 
 def _actions_are_positions(buffer: ReplayBuffer) -> bool:
-    apart = [
-        np.linalg.norm(buffer.action[e.start : e.stop - 1, :3] - buffer.state[e.start + 1 : e.stop, :3], axis=1)
-        for e in buffer.episodes
-    ]
-    return bool(np.median(np.concatenate(apart)) < _REACHED_M)
+    """Whether the gripper is where its actions sent it, at once or later."""
+    for steps in _LATER:
+        sent, there, _ = _paired(buffer, steps)
+        apart = float(np.median(np.linalg.norm(sent - there, axis=1))) if len(sent) else np.inf
+        if steps == 1 and apart < _REACHED_M:
+            return True
+        axes = _moving_axes(there)
+        if len(axes) < 2 or apart > _LEADS_M:
+            continue
+        alike = np.array([_correlation(sent[:, k], there[:, k]) for k in axes])
+        slope = alike * sent.std(0)[axes] / there.std(0)[axes]
+        if alike.min() > _ALIKE and _SLOPES[0] < slope.min() and slope.max() < _SLOPES[1]:
+            return True
+    return False
+
+
+def _actions_are_displacements(buffer: ReplayBuffer) -> bool:
+    """Whether the gripper goes along the world's axes as its actions say, in whatever unit."""
+    for steps in range(1, _MOST_STEPS + 1):
+        sent, there, way = _paired(buffer, steps)
+        axes = _moving_axes(there)
+        if len(axes) < 2:
+            continue
+        alike = np.array([[_correlation(sent[:, k], way[:, j]) for j in axes] for k in axes])
+        if np.diag(alike).min() > _COMMANDED and (np.abs(alike).argmax(1) == np.arange(len(axes))).all():
+            return True
+    return False
+
+
+def _moving_axes(places: np.ndarray) -> np.ndarray:
+    """The axes along which places vary."""
+    return np.flatnonzero(places.std(0) > _VARIES_M) if len(places) else np.zeros(0, int)
+
+
+def _paired(buffer: ReplayBuffer, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First three numbers of the actions, where the gripper is so many steps later, and its way until then [m]."""
+    rows = np.concatenate([np.arange(e.start, max(e.stop - steps, e.start)) for e in buffer.episodes])
+    there = np.asarray(buffer.state[rows + steps, :3], float)
+    return np.asarray(buffer.action[rows, :3], float), there, there - buffer.state[rows, :3]
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's; 0 where one of them is always the same."""
+    spread = float(a.std() * b.std())
+    return float(((a - a.mean()) * (b - b.mean())).mean() / spread) if spread > 0 else 0.0

@@ -25,6 +25,8 @@ from flowlab.sim.scene_settings import SceneSettings
 
 FOLDER = "evaluation"
 """Of a run: holds a folder for every checkpoint and number of executed steps."""
+CHOOSING = "execution"
+"""Likewise, of episodes that decided how many steps of a plan to execute, and count for nothing else."""
 _FOLDER_NAME = re.compile(r"step-(\d{1,18})-execute-(\d{1,9})")
 
 
@@ -38,11 +40,13 @@ class CheckpointRef:
     n_action_steps: int
     """Steps of every plan that are executed."""
     trained: TrainedPolicy
+    folder: str = FOLDER
+    """Of the run, where its episodes are kept."""
 
     @property
     def episodes(self) -> Path:
         """The file that keeps how its episodes went."""
-        return self.run / FOLDER / f"step-{self.step:08d}-execute-{self.n_action_steps}" / EPISODES
+        return self.run / self.folder / f"step-{self.step:08d}-execute-{self.n_action_steps}" / EPISODES
 
     @property
     def scene(self) -> SceneSettings:

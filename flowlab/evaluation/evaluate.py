@@ -1,13 +1,16 @@
 """Evaluate trained policies: which episodes are missing, who tries them, and what came out."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from flowlab.arguments import check_count, check_counts, check_names, check_optional_count, check_paths
 from flowlab.engines.base import StartEngine, core_count, engine_by_name
 from flowlab.errors import UnfinishedError, UsageError
 from flowlab.evaluation.checkpoints import CheckpointRef, common_tasks, find_checkpoint, find_checkpoints
+from flowlab.evaluation.execution import AUTO, check_not_choosing, choose_execution
 from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.evaluation.trials import Trial, check_unseen, list_trials
@@ -28,7 +31,7 @@ def evaluate(
     tasks: Sequence[str] | str = (),
     seeds: Sequence[int] | int = (0, 1, 2),
     episodes: int = 20,
-    n_action_steps: int | None = None,
+    n_action_steps: int | Literal["auto"] | None = None,
     checkpoints: bool = False,
     engine: str = "local",
     workers: int | None = None,
@@ -45,7 +48,8 @@ def evaluate(
         tasks: What to try; by default all tasks that every policy was trained on.
         seeds: Evaluation seeds, which decide the scenes: the same for every policy.
         episodes: How many to try of each task and seed.
-        n_action_steps: Steps of every plan to execute; by default as many as each policy was trained to.
+        n_action_steps: Steps of every plan to execute; by default as many as each policy was trained to. ``auto``
+            chooses for each run: as many, half, or a quarter, whatever solves most of 20 other layouts of each task.
         checkpoints: Evaluate every checkpoint of the runs, not the newest alone.
         engine: Name or import path of what runs the workers.
         workers: How many; by default one for each core that this process may use.
@@ -70,17 +74,25 @@ def evaluate(
         check_counts(seeds, "seeds", least=None),
         check_count(episodes, "episodes"),
     )
-    n_action_steps = check_optional_count(n_action_steps, "n_action_steps")
+    chooses = n_action_steps == AUTO
+    steps = None if chooses else check_optional_count(n_action_steps, "n_action_steps")
     workers = check_optional_count(workers, "workers")
-    refs = [ref for path in paths for ref in _checkpoints_of(path, n_action_steps, every=checkpoints)]
+    refs = [ref for path in paths for ref in _checkpoints_of(path, steps, every=checkpoints)]
     trials = list_trials(common_tasks(refs, tasks), seeds, episodes)
-    found = evaluate_checkpoints(
-        refs, trials, engine=engine, workers=workers, device=device, on_progress=on_progress or (lambda done, of: None)
-    )
+    progress = on_progress or (lambda done, of: None)
+    run_trials = partial(evaluate_checkpoints, engine=engine, workers=workers, device=device, on_progress=progress)
+    choices = {}
+    if chooses:
+        check_not_choosing(seeds)
+        newest = {ref.run: ref for ref in sorted(refs, key=lambda r: r.step)}
+        choices = {run: choose_execution(ref, common_tasks(refs, tasks), run_trials) for run, ref in newest.items()}
+        refs = [replace(ref, n_action_steps=choices[ref.run].best) for ref in refs]
+    found = run_trials(refs, trials)
     by_run: dict[Path, list[CheckpointEvaluation]] = {}
     for ref, evaluation in zip(refs, found, strict=True):
         by_run.setdefault(ref.run, []).append(evaluation)
-    return [describe_run(run, evaluations) for run, evaluations in by_run.items()]
+    described = [describe_run(run, evaluations) for run, evaluations in by_run.items()]
+    return [r.model_copy(update={"execution": choices.get(run)}) for run, r in zip(by_run, described, strict=True)]
 
 
 def evaluate_checkpoints(

@@ -1,11 +1,11 @@
 """What is known of an evaluated policy: how it was trained, and how every episode went."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, NonNegativeInt, model_validator
 
-from flowlab.config import Settings
+from flowlab.config import Settings, later
 from flowlab.evaluation.trials import Trial
 from flowlab.text import shown
 
@@ -121,6 +121,23 @@ class TrainingRecord(Settings):
         return steps
 
 
+class ExecutionChoice(Settings):
+    """How many layouts a policy solves with so many steps of every plan executed, none of which is reported."""
+
+    solved: Mapping[int, int]
+    """By steps executed."""
+    of: int
+
+    @property
+    def best(self) -> int:
+        """The number that solves most; of equal ones the largest, which takes the fewest plans."""
+        return max(self.solved, key=lambda steps: (self.solved[steps], steps))
+
+    def __str__(self) -> str:
+        each = ", ".join(f"{n} by {steps}" for steps, n in sorted(self.solved.items(), reverse=True))
+        return f"executes {self.best} steps of every plan: of {self.of} other layouts solved are {each}"
+
+
 class PolicyResult(Settings):
     """A policy, its training and its evaluations."""
 
@@ -132,6 +149,8 @@ class PolicyResult(Settings):
     training: TrainingRecord
     evaluations: tuple[CheckpointEvaluation, ...]
     """In order of steps; the last is of the newest weights and is the one that counts."""
+    execution: Annotated[ExecutionChoice | None, later(None)] = None
+    """How it was chosen how many steps of a plan are executed; None where nothing was chosen."""
 
     @property
     def final(self) -> Sequence[EpisodeResult]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from flowlab.checksums import CHECKSUM
 from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
-from flowlab.evaluation.checkpoints import FOLDER
+from flowlab.evaluation.checkpoints import CHOOSING, FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
 from flowlab.policies.checkpoint import build_policy, load_policy
 from flowlab.policies.run_config import has_begun, read_run_config
@@ -40,7 +40,8 @@ def validate_run(path: Path) -> Iterator[Finding]:
     checks: list[Callable[[], None]] = [lambda: _check_begun(path), lambda: _check_plan(path)]
     checks += [lambda w=w: _check_checkpoint(w) for w in checkpoint_files(path)]  # type: ignore[misc]
     checks += [lambda: _check_resume(path), lambda: _check_metrics(path)]
-    checks += [lambda e=e: _check_episodes(e) for e in sorted((path / FOLDER).glob(f"*/{EPISODES}"))]  # type: ignore[misc]
+    tried = [e for folder in (FOLDER, CHOOSING) for e in sorted((path / folder).glob(f"*/{EPISODES}"))]
+    checks += [lambda e=e: _check_episodes(e) for e in tried]  # type: ignore[misc]
     seen = set()
     for check in checks:
         try:

@@ -1,6 +1,7 @@
 """Videos of evaluated episodes."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from flowlab.evaluation.checkpoints import CheckpointRef, find_checkpoint
@@ -19,25 +20,24 @@ def write_videos(
     results: Sequence[PolicyResult],
     count: int,
     out: Path | None = None,
-    n_action_steps: int | None = None,
 ) -> list[Path]:
     """Videos and Rerun recordings of the first successes and failures of every policy and task.
 
     Args:
-        runs: As they were given to :func:`flowlab.evaluate`, and ``n_action_steps`` too.
+        runs: As they were given to :func:`flowlab.evaluate`.
         results: What it returned.
         count: How many successes, and how many failures, of each policy and task.
         out: The report's folder; by default each run keeps its own, beside its episodes.
-        n_action_steps: Steps of every plan to execute; None executes as many as each policy was trained to.
 
     Returns:
         The videos.
     """
     newest: dict[Path, CheckpointRef] = {}
-    for ref in (find_checkpoint(path, n_action_steps) for path in runs):
+    for ref in (find_checkpoint(path) for path in runs):
         newest[ref.run] = max(newest.get(ref.run, ref), ref, key=lambda r: r.step)
     made = []
-    for checkpoint, result in zip(newest.values(), results, strict=True):
+    for ref, result in zip(newest.values(), results, strict=True):
+        checkpoint = replace(ref, n_action_steps=result.evaluations[-1].n_action_steps)
         folder = (checkpoint.episodes.parent if out is None else out) / FOLDER
         made += [write_episode_video(checkpoint, trial, folder) for trial in _first_of_each(result.final, count)]
     return made

@@ -238,3 +238,8 @@ def _describe(trainer: Trainer) -> Iterator[str]:
         yield f"{trainer.folder}: goes on after step {trainer.step:,} of {planned.steps:,}"
     if spec.settings.relative_to_gripper and spec.channels.gripper is None:
         yield "points are given in the world frame: the data do not tell where in it the gripper is"
+    if (spec.settings.batch.shift_m or spec.settings.batch.turn_deg) and not spec.channels.shifts:
+        yield (
+            "no scene is shifted or turned in training (batch.shift_m, batch.turn_deg): the data do not tell what "
+            "their actions would be elsewhere"
+        )

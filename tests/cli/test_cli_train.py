@@ -179,7 +179,11 @@ def test_several_tasks_share_a_policy(tmp_path: Path, capsys: Capture) -> None:
 
 def test_dp3_trains_on_a_store_in_its_own_layout(rolls: Path, tmp_path: Path, capsys: Capture) -> None:
     assert call_cli(capsys, "export", rolls, "--to", "dp3", "--out", tmp_path / "roll.zarr")[0] == 0
-    train(capsys, tmp_path / "roll.zarr", "--policy", "dp3", "--out", tmp_path / "run", *SMALL)
+    code, _, err = call_cli(
+        capsys, "train", tmp_path / "roll.zarr", "--policy", "dp3", "--out", tmp_path / "run", *SMALL
+    )
+    assert code == 0, err
+    assert "no scene is shifted or turned in training" in err, "the store does not say what its actions are"
     check_run(tmp_path / "run")
     about = policy_of(tmp_path / "run")["policy"]
     assert (about["observer"], about["tasks"], about["channels"]["gripper"]) == (None, ["roll"], None)
@@ -205,6 +209,7 @@ def test_recordings_train_with_actions_that_are_places(tmp_path: Path, capsys: C
     code, _, err = call_cli(capsys, "train", tmp_path / "d", "--policy", "fdp", "--out", tmp_path / "run", *SMALL)
     assert code == 0, err
     assert "world frame" not in err
+    assert "no scene is shifted" not in err
     check_run(tmp_path / "run")
     policy = policy_of(tmp_path / "run")["policy"]
     found = {"gripper": [0, 1, 2], "state_positions": [[0, 1, 2]], "action_position": [0, 1, 2]}

@@ -321,13 +321,15 @@ def test_where_not_every_direction_is_known_nothing_is_turned(unknown: str) -> N
     assert shift.abs().max() > 0.01
 
 
-def test_what_is_not_known_to_be_a_place_stays() -> None:
+@pytest.mark.parametrize("known", [(), ("gripper",), ("action_displacement",)])
+def test_a_scene_stays_where_nobody_knows_what_its_actions_would_be_elsewhere(known: tuple[str, ...]) -> None:
     buffer, s = random_buffer(), fdp("batch.shift_m=0.1")
+    channels = ChannelSpec(**dict.fromkeys(known, (0, 1, 2)))
     windows = every_window(buffer, s)
-    plain, shifted = (builder(s, buffer).build(windows, rng) for rng in (None, np.random.default_rng(0)))
-    assert torch.equal(shifted.state, plain.state)
-    assert torch.equal(shifted.action, plain.action)
-    assert not torch.equal(shifted.points, plain.points)
+    plain, shifted = (builder(s, buffer, channels).build(windows, rng) for rng in (None, np.random.default_rng(0)))
+    for name in ("state", "action", "queries", "flow"):
+        torch.testing.assert_close(getattr(shifted, name), getattr(plain, name))
+    assert torch.equal(shifted.points, plain.points)
 
 
 def test_variation_is_a_function_of_the_generator_and_leaves_the_corpus_alone() -> None:

@@ -22,6 +22,9 @@ from trained_runs import NETWORK, leftovers, make_run, options, policy_of
 import flowlab
 from flowlab.cli import main
 from flowlab.errors import DataError
+from flowlab.evaluation import execution
+from flowlab.evaluation.checkpoints import CheckpointRef, find_checkpoint
+from flowlab.evaluation.results import CheckpointEvaluation, EpisodeResult
 from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.policies.checkpoint import load_policy
@@ -208,6 +211,44 @@ def test_a_single_step_of_every_plan_is_executed(fdp: Path, tmp_path: Path, caps
     (episode,) = roll_out(policy, SimulatorPool(TASK, SceneSettings()), [Trial(TASK, 0, 0)], n_action_steps=1)
     assert episode.result.steps == line["steps"]
     assert len(episode.predicted) == len(episode.rollout)
+
+
+def test_how_many_steps_to_execute_is_chosen_on_other_layouts(
+    fdp: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a policy that solves nothing all are equal, and the fewest plans win; nothing is tried twice."""
+    monkeypatch.setattr(execution, "_LAYOUTS", 1)
+    run, asked = copy(fdp, tmp_path), ("--task", TASK, "--seeds", 0, "--episodes", 1, "--execute", "auto")
+    (result,) = json.loads(evaluate(capsys, run, *asked, "--json"))
+    assert result["execution"] == {"solved": {"2": 0, "4": 0, "8": 0}, "of": 1}
+    assert [(e["n_action_steps"], len(e["outcomes"])) for e in result["evaluations"]] == [(8, 1)]
+    for steps in (2, 4, 8):
+        (line,) = lines_of(run, PLACE.replace("evaluation", "execution").replace("execute-8", f"execute-{steps}"))
+        assert (line["seed"], line["scene_seed"]) == (3999, 4_000_000_000), "a layout that is not reported"
+    before = files_below(run)
+    out = evaluate(capsys, run, *asked)
+    assert "fdp: executes 8 steps of every plan: of 1 other layouts solved are 0 by 8, 0 by 4, 0 by 2" in out
+    assert files_below(run) == before
+    code, err = refused(capsys, run, "--execute", "auto", "--seeds", "0,3999")
+    assert (code, "seed 3999: its layouts are those on which --execute auto chooses" in err) == (2, True)
+
+
+@pytest.mark.parametrize(("solved", "best"), [((5, 9, 8), 4), ((9, 9, 9), 8), ((3, 4, 4), 4), ((0, 0, 1), 2)])
+def test_what_solves_most_is_executed(fdp: Path, solved: tuple[int, int, int], best: int) -> None:
+    """Of equal ones that with the fewest plans."""
+
+    def tried(refs: Sequence[CheckpointRef], trials: Sequence[Trial]) -> list[CheckpointEvaluation]:
+        by = dict(zip((8, 4, 2), solved, strict=True))
+        about: dict[str, Any] = {"success_dp3": False, "steps": 9}
+        return [
+            CheckpointEvaluation(step=r.step, n_action_steps=r.n_action_steps, outcomes=tuple(
+                EpisodeResult(task=t.task, seed=t.seed, episode=t.episode, scene_seed=t.scene_seed,
+                              success=k < by[r.n_action_steps], **about)
+                for k, t in enumerate(trials)))
+            for r in refs
+        ]  # fmt: skip
+
+    assert execution.choose_execution(find_checkpoint(fdp), [TASK], tried).best == best
 
 
 def test_checkpoints_make_a_curve(fdp: Path, tmp_path: Path, capsys: Capture) -> None:
