@@ -42,6 +42,7 @@ def check(out: Path) -> None:
     assert not list(validate(out))
 
 
+@pytest.mark.slow
 def test_the_recipe_for_slurm(tmp_path: Path) -> None:
     (recipe,) = blocks(PAGE, "shell")
     (tmp_path / "hard.sh").write_text(script(recipe, tmp_path / "data"))
