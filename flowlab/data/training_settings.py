@@ -96,8 +96,8 @@ class TrainSettings(Settings):
     """Frames an action is decided on."""
     horizon: _Steps = 16
     """Steps that are predicted, from the first of those frames on."""
-    n_action_steps: _Steps = 8
-    """Of those, how many are executed, from the last of those frames on."""
+    n_action_steps: _Steps = 4
+    """Of those, how many are executed, from the last of those frames on; the paper and DP3 execute 8."""
     batch: BatchSettings = BatchSettings()
     optimizer: OptimizerSettings = OptimizerSettings()
     data: DataSettings = DataSettings()

@@ -49,7 +49,7 @@ def evaluate(
         seeds: Evaluation seeds, which decide the scenes: the same for every policy.
         episodes: How many to try of each task and seed.
         n_action_steps: Steps of every plan to execute; by default as many as each policy was trained to. ``auto``
-            chooses for each run: as many, half, or a quarter, whatever solves most of 20 other layouts of each task.
+            chooses for each run among these and 2, 4 and 8 what solves most of 20 other layouts of each task.
         checkpoints: Evaluate every checkpoint of the runs, not the newest alone.
         engine: Name or import path of what runs the workers.
         workers: How many; by default one for each core that this process may use.

@@ -14,8 +14,8 @@ CHOOSING_SEED = MOST_SEEDS - 1
 """Evaluation seed of the layouts on which it is chosen, and no other evaluation is made."""
 _LAYOUTS = 20
 """Of every task."""
-_HALVINGS = 2
-"""As many as in training is tried, half of that, and a quarter."""
+_TRIED = (2, 4, 8)
+"""Steps, beside as many as the policy was trained to execute, as far as it plans ahead."""
 
 
 def choose_execution(
@@ -23,7 +23,7 @@ def choose_execution(
     tasks: Sequence[str],
     evaluate: Callable[[Sequence[CheckpointRef], Sequence[Trial]], list[CheckpointEvaluation]],
 ) -> ExecutionChoice:
-    """Try as many steps as the policy was trained to execute, half of them, and a quarter.
+    """Try as many steps as the policy was trained to execute, and 2, 4 and 8.
 
     What is tried is kept in the run's folder, so that the same choice is made again at once.
 
@@ -32,8 +32,8 @@ def choose_execution(
         tasks: On layouts of these.
         evaluate: Tries every trial with every checkpoint.
     """
-    most = checkpoint.trained.policy.settings.n_action_steps
-    tried = sorted({max(1, most >> k) for k in range(_HALVINGS + 1)})
+    s = checkpoint.trained.policy.settings
+    tried = sorted({s.n_action_steps, *(n for n in _TRIED if n <= s.horizon - s.n_obs_steps + 1)})
     trials = list_trials(tasks, (CHOOSING_SEED,), _LAYOUTS)
     found = evaluate([replace(checkpoint, n_action_steps=n, folder=CHOOSING) for n in tried], trials)
     solved = {n: sum(o.success for o in e.outcomes) for n, e in zip(tried, found, strict=True)}

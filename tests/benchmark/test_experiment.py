@@ -146,8 +146,8 @@ def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: 
         }
         assert tried == {1: [(0, 0, 1_000_000)], 2: [(0, 0, 1_000_000), (0, 1, 1_000_001)]}
         for e in found["evaluations"]:
-            assert e["n_action_steps"] == 8
-            log = run / f"evaluation/step-{e['step']:08d}-execute-8/episodes.jsonl"
+            assert e["n_action_steps"] == 4
+            log = run / f"evaluation/step-{e['step']:08d}-execute-4/episodes.jsonl"
             lines = [json.loads(line) for line in log.read_text().splitlines()]
             assert all(line.pop("sha256") for line in lines)
             assert sorted(lines, key=lambda x: x["episode"]) == e["outcomes"]
@@ -315,7 +315,7 @@ def spoil(columns: Path, how: str) -> None:
         "number": rows.replace(",1000000,", ",many,"),
         "column": rows.replace("n_action_steps", "executed"),
         "row": rows + "1,2\n",
-        "evaluation": rows.replace("\n2,8,", "\n3,8,"),
+        "evaluation": rows.replace("\n2,4,", "\n3,4,"),
         "zeros": rows + "0" * (MAX_TEXT_BYTES + 1),
     }
     packed = gzip.compress(changed[how].encode())
@@ -330,7 +330,7 @@ SPOILED = {
     "number": "is no table of episodes",
     "column": "is no table of episodes (it has no column n_action_steps)",
     "row": "is no table of episodes",
-    "evaluation": "has episodes at step 3, 8 steps executed, of which",
+    "evaluation": "has episodes at step 3, 4 steps executed, of which",
     "zeros": "is no table of episodes (it unpacks to more than",
     "gone": "there is no such file",
 }

@@ -151,8 +151,8 @@ def test_frames_are_wanted_at_the_plans_and_the_step_before_them(run: Path) -> N
         policy.act(plate() if policy.wants_frame else None, STATE)
         assert policy.step == k + 1
         planned.append(policy.planned_at)
-    assert [k for k in range(18) if wanted[k]] == [0, 7, 8, 15, 16]
-    assert planned == [0] * 8 + [8] * 8 + [16] * 2
+    assert [k for k in range(18) if wanted[k]] == [0, 3, 4, 7, 8, 11, 12, 15, 16]
+    assert planned == [0] * 4 + [4] * 4 + [8] * 4 + [12] * 4 + [16] * 2
 
 
 def test_a_frame_that_is_not_wanted_changes_nothing(run: Path) -> None:
@@ -173,7 +173,7 @@ def test_executing_one_step_plans_every_time(run: Path) -> None:
 def test_what_the_network_plans_is_what_comes_out(run: Path) -> None:
     """Put together by hand from the network, the Observer and the first frame."""
     policy = Policy.load(run, seed=5)
-    done = act(policy, 8)
+    done = act(policy, 4)
     net = load_policy(run).policy
     points = torch.from_numpy(Observer(ObserverSettings(points=64), "roll").observe(plate()).points_world)
     assert policy.queries is not None
@@ -185,7 +185,7 @@ def test_what_the_network_plans_is_what_comes_out(run: Path) -> None:
         task=torch.zeros(1, dtype=torch.long),
     )
     plan = net.plan(context, torch.Generator().manual_seed(5))
-    np.testing.assert_allclose(done, plan.action[0, 1:9], atol=1e-5)
+    np.testing.assert_allclose(done, plan.action[0, 1:5], atol=1e-5)
     assert plan.flow is not None
     assert policy.flow is not None
     assert policy.flow.shape == (15, 8, 3)

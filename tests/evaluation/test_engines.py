@@ -14,7 +14,7 @@ import flowlab
 from flowlab.engines.base import Engine, UnitResult
 
 Capture = pytest.CaptureFixture[str]
-LINES = "evaluation/step-00000002-execute-8/episodes.jsonl"
+LINES = "evaluation/step-00000002-execute-4/episodes.jsonl"
 STARTED: list[dict[str, Any]] = []
 
 

@@ -9,7 +9,7 @@ from synthetic import call_cli
 from trained_runs import NETWORK, make_run, options, policy_of, saved_by
 
 Capture = pytest.CaptureFixture[str]
-LINES = "evaluation/step-00000002-execute-8/episodes.jsonl"
+LINES = "evaluation/step-00000002-execute-4/episodes.jsonl"
 OWN_EXPERT = '''
 from flowlab.pipeline.stages.simulation import ExpertStage
 

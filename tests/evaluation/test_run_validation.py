@@ -21,7 +21,7 @@ from flowlab.policies.trained import FREE
 
 Capture = pytest.CaptureFixture[str]
 OLD = Path(__file__).parents[1] / "fixtures/old/runs"
-EPISODES = "evaluation/step-00000020-execute-8/episodes.jsonl"
+EPISODES = "evaluation/step-00000020-execute-4/episodes.jsonl"
 
 
 @pytest.fixture(scope="module")

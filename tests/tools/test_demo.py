@@ -32,7 +32,7 @@ def demo(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def try_out(folder: Path, *success: bool) -> None:
     """What `flowlab eval` keeps of episodes, the last written first."""
-    kept = folder / "run" / "evaluation" / "step-00000009-execute-8"
+    kept = folder / "run" / "evaluation" / "step-00000009-execute-4"
     kept.mkdir(parents=True)
     lines = [
         {"task": "plate-slide", "seed": 0, "episode": k, "success": s, "steps": 50 + k} for k, s in enumerate(success)
