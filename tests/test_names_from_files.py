@@ -12,7 +12,7 @@ from trained_runs import SMALL, make_rolls, make_run
 
 from flowlab.checksums import with_checksum
 from flowlab.errors import DataError, UsageError
-from flowlab.policies.checkpoint import FREE, read_trained
+from flowlab.policies.trained import FREE, read_trained
 from flowlab.registry import REGISTRIES, Registry, names_from_file
 
 Capture = pytest.CaptureFixture[str]

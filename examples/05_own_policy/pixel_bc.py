@@ -24,7 +24,7 @@ from torch.nn import functional
 from flowlab.config import Settings
 from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import Needs
-from flowlab.data.normalizer import Scaler
+from flowlab.data.scaler import Scaler
 from flowlab.data.training_settings import BatchSettings, TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec

@@ -16,13 +16,14 @@ from flowlab.data.training_settings import TrainSettings
 from flowlab.engines.base import StartEngine, engine_by_name
 from flowlab.errors import DataError, UnfinishedError
 from flowlab.evaluation.checkpoints import find_checkpoints
-from flowlab.evaluation.evaluate import evaluate_here
+from flowlab.evaluation.episode_batches import evaluate_here
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.pipeline.extraction import extract
 from flowlab.pipeline.units import JobShard
-from flowlab.policies.checkpoint import newest_checkpoint, read_trained, step_of
-from flowlab.policies.run_folder import read_resume, read_run_config
+from flowlab.policies.run_config import read_run_config
+from flowlab.policies.run_folder import read_resume
+from flowlab.policies.trained import newest_checkpoint, read_trained, step_of
 from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
 from flowlab.text import counted

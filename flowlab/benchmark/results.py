@@ -16,7 +16,7 @@ from flowlab.evaluation.checkpoints import read_evaluations
 from flowlab.evaluation.results import PolicyResult
 from flowlab.evaluation.training_record import describe_run
 from flowlab.files import remove_leftovers, told_when_unwritable, write_atomically
-from flowlab.policies.checkpoint import read_trained
+from flowlab.policies.trained import read_trained
 from flowlab.text import shown
 from flowlab.untrusted import is_there, read_json
 

@@ -7,7 +7,7 @@ from flowlab.benchmark.expert_results import EXPERT, read_expert
 from flowlab.benchmark.results import UNITS, read_result
 from flowlab.errors import DataError
 from flowlab.evaluation.validation import validate_run
-from flowlab.policies.checkpoint import POLICY
+from flowlab.policies.trained import POLICY
 from flowlab.storage.manifest import MANIFEST
 from flowlab.storage.validation import Finding, finding_of, validate
 

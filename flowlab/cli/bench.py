@@ -81,14 +81,8 @@ def bench(
     once its result is in OUT/units, and neither runs nor datasets are needed for it then. The parts of --shard may
     share one OUT, or have one each whose OUT/units are brought together.
     """
-    from flowlab.benchmark.experiment import run_experiment
-    from flowlab.benchmark.expert_results import read_experts
     from flowlab.benchmark.recipe import load_experiment, with_variants
-    from flowlab.benchmark.summary import summarize
-    from flowlab.benchmark.units import plan_units
     from flowlab.pipeline.units import JobShard
-    from flowlab.report.tables import summary_tables
-    from flowlab.report.write import write_report
 
     changes: dict[str, Any] = {
         "tasks": (*groups, *tasks) or None,
@@ -111,12 +105,20 @@ def bench(
     if dry_run:
         _say_what_is_left(asked, out, part, workers, as_json)
         return
+    from flowlab.benchmark.experiment import run_experiment
+
     results = run_experiment(asked, out, engine=engine, workers=workers, shard=part, on_progress=_print_progress)
     if not results:
         warn(f"nothing of this experiment is done yet, and nothing of it belongs to part {shard}")
         if as_json:
             print_json([])
         return
+    from flowlab.benchmark.expert_results import read_experts
+    from flowlab.benchmark.summary import summarize
+    from flowlab.benchmark.units import plan_units
+    from flowlab.report.tables import summary_tables
+    from flowlab.report.write import write_report
+
     summary = summarize(results, experts=read_experts([out]), planned=plan_units(asked))
     write_report(out, summary, results)
     if as_json:

@@ -69,7 +69,6 @@ def evaluate(
         return
     if data is not None:
         raise UsageError("--data is about held-out demonstrations; add --offline")
-    from flowlab.benchmark.summary import summarize
     from flowlab.evaluation import evaluate as evaluation
 
     with ProgressBar() as bar:
@@ -90,6 +89,8 @@ def evaluate(
         from flowlab.report.videos import write_videos
 
         videos = write_videos(runs, results, films, out)
+    from flowlab.benchmark.summary import summarize
+
     summary = summarize(results)
     if out is not None:
         from flowlab.report.write import write_report

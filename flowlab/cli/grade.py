@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from flowlab.cli.console import echo, json_option, print_json, print_table, quiet_option, say
 from flowlab.cli.paths import PATH
-from flowlab.cli.values import installed, names_option, tasks_and_groups
+from flowlab.cli.values import engine_option, installed, names_option, tasks_and_groups
 from flowlab.errors import UsageError
 from flowlab.registry import TRACKERS
 
@@ -57,6 +57,8 @@ _ABOUT_SUMMARY = (
 @click.option("--weights", type=PATH, help="File of a learned tracker's weights.")
 @click.option("--chunk", type=click.IntRange(min=2), help="Frames tracked at a time.")
 @click.option("--stride", type=click.IntRange(min=1), help="Frames from one chunk to the next.")
+@engine_option
+@click.option("--workers", type=click.IntRange(min=1), help="Recordings at a time  [one for each core].")
 @click.option("--out", type=PATH, default=Path("grade"), show_default=True, help="Folder to write.")
 @quiet_option
 @json_option
@@ -73,6 +75,8 @@ def grade(
     weights: Path | None,
     chunk: int | None,
     stride: int | None,
+    engine: str,
+    workers: int | None,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -91,7 +95,6 @@ def grade(
     from flowlab.grading.run import REPORT
     from flowlab.grading.run import grade as run_grading
     from flowlab.sim.tasks import tasks_named
-    from flowlab.viz.grade_figure import draw_grades
 
     report = run_grading(
         recordings,
@@ -106,8 +109,12 @@ def grade(
         settings=changes,
         weights=weights,
         chunks=_chunk_settings(chunk, stride),
+        engine=engine,
+        workers=workers,
         on_progress=say,
     )
+    from flowlab.viz.grade_figure import draw_grades
+
     picture = out / "grade.png"
     draw_grades({t.name: t.mean for t in report.trackers}, picture, graded=report.graded, about=report.about)
     if as_json:

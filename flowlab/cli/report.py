@@ -31,22 +31,26 @@ def report(sources: tuple[Path, ...], out: Path | None, recipe: str | None, as_j
     from flowlab.benchmark.expert_results import read_experts
     from flowlab.benchmark.recipe import load_experiment
     from flowlab.benchmark.results import read_results
-    from flowlab.benchmark.robot_trials import read_robot_trials
-    from flowlab.benchmark.summary import summarize
     from flowlab.benchmark.units import plan_units
-    from flowlab.report.tables import robot_trial_tables, summary_tables
-    from flowlab.report.write import write_report
 
     tables = [source for source in sources if source.suffix == ".csv"]
     if out is None:
         if len(sources) != 1 or tables:
             raise UsageError("--out: say where to write the report, as in --out results/robot")
         out = sources[0]
+    if tables:
+        from flowlab.benchmark.robot_trials import read_robot_trials
     robot_trials = [trial for table in tables for trial in read_robot_trials(table)]
     folders = [source for source in sources if source.suffix != ".csv"]
     results = read_results(folders)
     planned = None if recipe is None else plan_units(load_experiment(recipe))
-    summary = summarize(results, experts=read_experts(folders), planned=planned)
+    experts = read_experts(folders)
+    # What writes it takes seconds to load, and does when nothing was refused.
+    from flowlab.benchmark.summary import summarize
+    from flowlab.report.tables import robot_trial_tables, summary_tables
+    from flowlab.report.write import write_report
+
+    summary = summarize(results, experts=experts, planned=planned)
     write_report(out, summary, results, robot_trials=robot_trials)
     if as_json:
         print_json(summary.to_json())

@@ -47,6 +47,9 @@ def serve(
         raise MissingLibraryError(
             f"flowlab serve needs websockets and msgpack: pip install 'flowlab[serve]' ({error})"
         ) from error
+    from flowlab.policies.trained import weights_at
+
+    weights_at(run)  # which takes no second, as PyTorch does
     from flowlab.serving.contract import ServedPolicy
     from flowlab.serving.episodes import ServedEpisodes
     from flowlab.serving.server import PolicyServer

@@ -3,9 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor, nn
 
 from flowlab.config import Settings
 from flowlab.data.channels import ChannelSpec
@@ -135,23 +133,3 @@ def _relative_limits(
             low[target] = np.minimum(low[target], away.min(0))
             high[target] = np.maximum(high[target], away.max(0))
     return low, high
-
-
-class Scaler(nn.Module):
-    """A :class:`Scale` that follows its network from device to device; its numbers are kept with the settings."""
-
-    offset: Tensor
-    unit: Tensor
-
-    def __init__(self, scale: Scale) -> None:
-        super().__init__()
-        self.register_buffer("offset", torch.tensor(scale.offset), persistent=False)
-        self.register_buffer("unit", torch.tensor(scale.unit), persistent=False)
-
-    def forward(self, values: Tensor) -> Tensor:
-        """Normalize."""
-        return (values - self.offset) / self.unit
-
-    def invert(self, normal: Tensor) -> Tensor:
-        """Back to the dataset's units."""
-        return normal * self.unit + self.offset

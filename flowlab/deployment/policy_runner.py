@@ -16,7 +16,8 @@ from flowlab.deployment.inputs import GivenCloud, explain_empty_cloud
 from flowlab.errors import DataError, UsageError
 from flowlab.perception.observer import Observer, ObserverSettings
 from flowlab.perception.queries import QuerySettings, queries_in
-from flowlab.policies.base import ActionPlan, PolicySpec
+from flowlab.policies.base import ActionPlan
+from flowlab.policies.spec import PolicySpec
 from flowlab.records import Frame, Queries
 
 Model = TypeVar("Model", bound=Settings)

@@ -12,7 +12,7 @@ from flowlab.errors import DataError, UsageError, unknown_name
 from flowlab.evaluation.episode_log import EPISODES, read_results
 from flowlab.evaluation.results import CheckpointEvaluation
 from flowlab.evaluation.trials import Trial
-from flowlab.policies.checkpoint import (
+from flowlab.policies.trained import (
     POLICY,
     TrainedPolicy,
     all_checkpoints,

@@ -1,50 +1,28 @@
 """Evaluate trained policies: which episodes are missing, who tries them, and what came out."""
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Literal
-
-import torch
+from typing import TYPE_CHECKING, Literal
 
 from flowlab.arguments import check_count, check_counts, check_names, check_optional_count, check_paths
-from flowlab.config import Settings
 from flowlab.engines.base import StartEngine, core_count, engine_by_name
 from flowlab.errors import UnfinishedError, UsageError
 from flowlab.evaluation.checkpoints import CheckpointRef, common_tasks, find_checkpoint, find_checkpoints
-from flowlab.evaluation.episode_log import append_result, read_results
 from flowlab.evaluation.execution import AUTO, check_not_choosing, choose_execution
 from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult
-from flowlab.evaluation.rollout import BATCH_SLOTS, SimulatorPool, roll_out
 from flowlab.evaluation.training_record import describe_run
 from flowlab.evaluation.trials import Trial, check_unseen, list_trials
-from flowlab.files import check_inside, remove_leftovers, told_when_unwritable
-from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.checkpoint import load_policy
-from flowlab.registry import POLICIES
-from flowlab.sim.scene_settings import SceneSettings
 from flowlab.text import counted
 
-_LARGEST_BATCH = 40
-"""Episodes given to a worker at a time: few enough that progress shows."""
+if TYPE_CHECKING:
+    from flowlab.evaluation.episode_batches import EpisodeBatch
+
+_WORK = "flowlab.evaluation.episode_batches"
+"""What workers need; it takes seconds to import, and is when nothing was refused."""
 Progress = Callable[[int, int], None]
 """Told how many episodes are done, of how many."""
-
-
-class EpisodeBatch(Settings):
-    """Some episodes of one task for one policy: what a worker does at a time."""
-
-    policy: str
-    """Name or import path of its kind, which whoever asked for the evaluation has loaded."""
-    weights: Path
-    episodes: Path
-    """The file that results are added to."""
-    scene: SceneSettings
-    n_action_steps: int
-    trials: tuple[Trial, ...]
-    device: str = "cpu"
 
 
 def evaluate(
@@ -133,38 +111,14 @@ def evaluate_checkpoints(
     for checkpoint in checkpoints:
         check_unseen(trials, checkpoint.trained.scene_seeds, checkpoint.run)
     workers = workers or core_count()
-    batches = [b for c in checkpoints for b in _missing_batches(c, trials, workers * 2, device)]
+    start_engine = engine_by_name(engine, workers, [_WORK])
+    from flowlab.evaluation.episode_batches import missing_batches
+
+    batches = [b for c in checkpoints for b in missing_batches(c, trials, workers * 2, device)]
     batches.sort(key=lambda b: b.trials[0].task)  # a worker keeps the simulations of the last task
     if batches:
-        start_engine = engine_by_name(engine, workers, [__name__])
         _run_batches(batches, len(checkpoints) * len(trials), start_engine, on_progress)
     return [c.read_evaluation(trials) for c in checkpoints]
-
-
-def evaluate_here(checkpoint: CheckpointRef, trials: Sequence[Trial], device: str = "cpu") -> CheckpointEvaluation:
-    """Try what has not been tried yet in this process, and return all results, with the CPU time they took."""
-    check_unseen(trials, checkpoint.trained.scene_seeds, checkpoint.run)
-    began, tried = time.process_time(), 0
-    for batch in _missing_batches(checkpoint, trials, 1, device):
-        tried += run_batch(batch)
-    found = checkpoint.read_evaluation(trials)
-    if not tried:
-        return found
-    spent = time.process_time() - began
-    return found.model_copy(update={"cpu_s": round(spent * len(trials) / tried, 1)})
-
-
-def run_batch(batch: EpisodeBatch) -> int:
-    """A worker's part: try every episode, keep each result as it ends, and say how many there were."""
-    torch.set_num_threads(1)
-    POLICIES.load(batch.policy)
-    policy = _policy(batch.weights, batch.device)
-    simulators = _simulators(batch.trials[0].task, batch.scene)
-    known = read_results(batch.episodes)  # by a worker that died over this batch
-    todo = [trial for trial in batch.trials if trial not in known]
-    for episode in roll_out(policy, simulators, todo, n_action_steps=batch.n_action_steps):
-        append_result(batch.episodes, episode.result)
-    return len(batch.trials)
 
 
 def _checkpoints_of(path: Path, n_action_steps: int | None, *, every: bool) -> list[CheckpointRef]:
@@ -173,9 +127,11 @@ def _checkpoints_of(path: Path, n_action_steps: int | None, *, every: bool) -> l
 
 
 def _run_batches(
-    batches: Sequence[EpisodeBatch], total: int, start_engine: StartEngine[EpisodeBatch, int], on_progress: Progress
+    batches: Sequence["EpisodeBatch"], total: int, start_engine: "StartEngine[EpisodeBatch, int]", on_progress: Progress
 ) -> None:
     """Have workers try every batch. Raises :class:`UnfinishedError` where some failed."""
+    from flowlab.evaluation.episode_batches import run_batch
+
     done = total - sum(len(b.trials) for b in batches)
     on_progress(done, total)
     failures = []
@@ -193,42 +149,3 @@ def _run_batches(
             f"{total - done} of {counted(total, 'episode')} could not be tried; the first failure: "
             f"{failures[0].splitlines()[-1]}; the same command tries them again"
         )
-
-
-def _missing_batches(
-    checkpoint: CheckpointRef, trials: Sequence[Trial], parts: int, device: str
-) -> Iterable[EpisodeBatch]:
-    """Batches of the trials that have no result yet, at least ``parts`` of them if there are enough."""
-    folder = checkpoint.episodes.parent
-    check_inside(checkpoint.run, checkpoint.episodes)
-    with told_when_unwritable(folder, "make room, or copy the run to where it can be written"):
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(folder)
-    known = read_results(checkpoint.episodes)
-    todo = [t for t in trials if t not in known]
-    rounds = -(-len(todo) // (parts * BATCH_SLOTS))  # every slot has as many episodes
-    size = min(rounds * BATCH_SLOTS, _LARGEST_BATCH)
-    for task in dict.fromkeys(t.task for t in todo):
-        of_task = [t for t in todo if t.task == task]
-        for first in range(0, len(of_task), size):
-            yield EpisodeBatch(
-                policy=checkpoint.trained.policy.settings.policy,
-                weights=checkpoint.weights,
-                episodes=checkpoint.episodes,
-                scene=checkpoint.scene,
-                n_action_steps=checkpoint.n_action_steps,
-                trials=tuple(of_task[first : first + size]),
-                device=device,
-            )
-
-
-@lru_cache(maxsize=4)
-def _policy(weights: Path, device: str) -> PolicyNetwork:
-    """A policy that this worker keeps for its next batch."""
-    return load_policy(weights, device).policy
-
-
-@lru_cache(maxsize=1)
-def _simulators(task: str, scene: SceneSettings) -> SimulatorPool:
-    """Simulators that this worker keeps for its next batch."""
-    return SimulatorPool(task, scene)

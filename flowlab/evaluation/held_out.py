@@ -9,9 +9,10 @@ from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
 from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
-from flowlab.policies.base import PolicySpec
-from flowlab.policies.checkpoint import RUN, LoadedPolicy, TrainedPolicy, check_observer
-from flowlab.policies.run_folder import RunConfig, check_positions, read_run_config
+from flowlab.policies.checkpoint import LoadedPolicy, check_observer
+from flowlab.policies.run_config import RunConfig, check_positions, read_run_config
+from flowlab.policies.spec import PolicySpec
+from flowlab.policies.trained import RUN, TrainedPolicy
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.shard import Shard
 from flowlab.untrusted import is_there

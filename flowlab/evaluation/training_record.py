@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flowlab.evaluation.results import CheckpointEvaluation, PolicyResult, TrainingRecord
-from flowlab.policies.checkpoint import count_weights, newest_checkpoint, read_trained
-from flowlab.policies.run_folder import read_run_config
+from flowlab.policies.run_config import read_run_config
+from flowlab.policies.trained import count_weights, newest_checkpoint, read_trained
 from flowlab.training.metrics import cpu_seconds_spent, last_metrics
 from flowlab.viz.training_metrics import METRICS
 

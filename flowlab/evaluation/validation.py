@@ -8,19 +8,19 @@ from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import CHOOSING, FOLDER
 from flowlab.evaluation.episode_log import EPISODES, read_results
-from flowlab.policies.checkpoint import (
+from flowlab.policies.checkpoint import build_policy, load_policy
+from flowlab.policies.run_config import has_begun, read_run_config
+from flowlab.policies.run_folder import lines_behind, read_resume
+from flowlab.policies.tensor_files import check_finite
+from flowlab.policies.trained import (
     POLICY,
     RESUME,
     RUN,
-    build_policy,
     checkpoint_files,
     checkpoint_name,
-    load_policy,
     read_trained,
     warn_of_lost_checkpoints,
 )
-from flowlab.policies.run_folder import has_begun, lines_behind, read_resume, read_run_config
-from flowlab.policies.tensor_files import check_finite
 from flowlab.storage.validation import Finding, finding_of
 from flowlab.untrusted import is_there, read_json
 from flowlab.viz.training_metrics import METRICS, metrics_lines

@@ -52,6 +52,30 @@ class RecordingGrade:
     truth: GroundTruth
     metrics: TrackMetrics
 
+    @classmethod
+    def of(
+        cls,
+        recording: Path,
+        truth: GroundTruth,
+        estimate: EstimatedTracks,
+        size: tuple[int, int],
+        cpu_s: float,
+        metrics: TrackMetrics,
+    ) -> "RecordingGrade":
+        """The grade of a recording's folder, with what the folder says of itself."""
+        return cls(
+            recording=recording.name,
+            origin=origin_of(recording),
+            size=size,
+            frames=len(truth.tracks_cam),
+            queries=len(truth.query_px),
+            unusable_queries=unusable_queries(recording),
+            cpu_s=cpu_s,
+            estimate=estimate,
+            truth=truth,
+            metrics=metrics,
+        )
+
     @property
     def scene(self) -> str:
         """The family of procedural scenes or the task that it is of; empty for a recording of somebody's own."""
@@ -132,6 +156,11 @@ def grade_tracker(
     for recording in recordings:
         rows.append(grade_recording(recording, tracker, chunks, lifting, metrics))
         report(rows[-1])
+    return summarize_rows(tracker, rows)
+
+
+def summarize_rows(tracker: Tracker, rows: Sequence[RecordingGrade]) -> TrackerGrade:
+    """The grades of a tracker, with their mean."""
     return TrackerGrade(tracker.describe(), tuple(rows), average([r.metrics for r in rows], _calibration(rows)))
 
 
@@ -149,18 +178,8 @@ def grade_recording(
     start = time.process_time()
     estimate = label_blind(clip, truth.query_px, tracker, chunks, lifting)
     cpu_s = time.process_time() - start
-    return RecordingGrade(
-        recording=recording.name,
-        origin=origin_of(recording),
-        size=(clip.camera.width, clip.camera.height),
-        frames=len(clip),
-        queries=len(truth.query_px),
-        unusable_queries=unusable_queries(recording),
-        cpu_s=cpu_s,
-        estimate=estimate,
-        truth=truth,
-        metrics=measure(estimate, truth, clip.camera, metrics),
-    )
+    size, figures = (clip.camera.width, clip.camera.height), measure(estimate, truth, clip.camera, metrics)
+    return RecordingGrade.of(recording, truth, estimate, size, cpu_s, figures)
 
 
 def read_clip(recording: Path) -> Clip:

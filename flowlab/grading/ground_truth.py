@@ -10,13 +10,13 @@ from flowlab.array_files import load_arrays
 from flowlab.errors import DataError, MissingFileError
 from flowlab.geometry.camera import pose_fault
 from flowlab.geometry.transforms import apply
-from flowlab.recordings.recording_yaml import TRUE_TRACKS
+from flowlab.recordings.recording_yaml import SIMULATED, TRUE_TRACKS
 from flowlab.records import Role
 from flowlab.text import cut, natural_key, shown
 from flowlab.untrusted import read_json
 
 FILE_NAME = TRUE_TRACKS
-MADE_WITH = "simulated.json"
+MADE_WITH = SIMULATED
 """In a simulated recording's folder: what it was made with, and how many queries could not be used."""
 
 

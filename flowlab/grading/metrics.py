@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from flowlab.array_files import load_arrays
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.moving import MOVING_IN_RECORDING_M
 from flowlab.grading.calibration import Calibration, calibrate, confidently_wrong
@@ -31,6 +33,16 @@ class EstimatedTracks:
     visible: Bool[np.ndarray, "T N"]
     sigma: Float32[np.ndarray, "T N"] | None = None
     """Stated error [m]; see :class:`flowlab.records.Quality`."""
+
+    def save(self, path: Path) -> None:
+        """Write the tracks into an ``.npz`` file."""
+        arrays = {"xyz_cam": self.xyz_cam, "visible": self.visible}
+        np.savez(path, **(arrays if self.sigma is None else arrays | {"sigma": self.sigma}))  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: Path) -> "EstimatedTracks":
+        """What :meth:`save` wrote."""
+        return cls(**load_arrays(path))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,22 +1,29 @@
 """A whole grading run: recordings found or simulated, labeled by some trackers, and compared with their truth."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowlab.arguments import check_count, check_names, check_path, check_paths, check_settings
-from flowlab.errors import FlowlabError, UsageError, unknown_name
-from flowlab.files import write_json
-from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_tracker
+from flowlab.arguments import (
+    check_count,
+    check_names,
+    check_optional_count,
+    check_path,
+    check_paths,
+    check_settings,
+)
+from flowlab.errors import UsageError, unknown_name
+from flowlab.files import told_when_unwritable, write_json
+from flowlab.grading.grade import TrackerGrade
 from flowlab.grading.ground_truth import find_with_truth
 from flowlab.grading.origin import seeds_in_words, sizes_in_words
+from flowlab.grading.units import GradedRecording, grade_on_engine
 from flowlab.sim.loading import load_mujoco
 from flowlab.text import counted
 from flowlab.tracking.base import Tracker, make_tracker
 from flowlab.tracking.chunking import ChunkSettings
-from flowlab.tracking.lifting import LiftSettings
 from flowlab.untrusted import parse_yaml
 
 REPORT = "grade.json"
@@ -77,6 +84,8 @@ def grade(
     settings: Sequence[str] = (),
     weights: Path | None = None,
     chunks: ChunkSettings = ChunkSettings(),
+    engine: str = "local",
+    workers: int | None = None,
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> GradingReport:
     """Label recordings whose truth is known, without looking at it, and say how far off the labels are.
@@ -95,6 +104,8 @@ def grade(
         settings: ``key=value`` of every tracker's options, or ``tracker.key=value`` of one tracker's.
         weights: File of a learned tracker's weights.
         chunks: How a recording is cut for trackers that take it in parts.
+        engine: Name or import path of what runs the workers, each of which makes and labels one recording at a time.
+        workers: How many; by default as many as the engine has cores.
         on_progress: Is told in words what is done.
 
     Returns:
@@ -113,28 +124,20 @@ def grade(
         raise UsageError(
             "nothing to grade; give folders with a ground_truth.npz, --scenes tabletop,hands or --tasks hammer,push"
         )
+    workers = check_optional_count(workers, "workers")
     made = [make_graded_tracker(name, trackers, settings, weights) for name in dict.fromkeys(trackers)]
-    folders = [folder for path in recordings for folder in find_with_truth(path)]
-    simulated: dict[str, Any] = {}
-    seeds = range(seed, seed + episodes)
-    if tasks:
-        more, simulated["tasks"] = _simulate(tasks, seeds, sensor or "kinect", size or (320, 240), out, on_progress)
-        folders += more
-    if scenes:
-        more, simulated["scenes"] = _film(scenes, seeds, sensor, size, out, on_progress)
-        folders += more
-    folders = list({folder.resolve(): folder for folder in folders}.values())
-
-    def tell(row: RecordingGrade) -> None:
-        on_progress(f"{row.recording}: {counted(row.frames, 'frame')} in {row.cpu_s:.1f} s of CPU time")
-
-    results = []
-    for tracker in made:
-        on_progress(f"labeling with {tracker.name}")
-        results.append(grade_tracker(folders, tracker, chunks, LiftSettings(), report=tell))
-    report = GradingReport(chunks, simulated or None, tuple(results))
-    with _writing(out):
+    own = [GradedRecording(folder.resolve()) for path in recordings for folder in find_with_truth(path)]
+    seeds, place = range(seed, seed + episodes), (out / "recordings").resolve()
+    of_tasks, tasks_made = _simulations(tasks, seeds, sensor or "kinect", size or (320, 240), place)
+    of_scenes, scenes_made = _films(scenes, seeds, sensor, size, place)
+    every = {r.folder: r for r in (*own, *of_tasks, *of_scenes)}
+    with told_when_unwritable(out, "choose another --out"):
         out.mkdir(parents=True, exist_ok=True)
+    grades = grade_on_engine(
+        list(every.values()), made, chunks, out, engine=engine, workers=workers, on_progress=on_progress
+    )
+    report = GradingReport(chunks, tasks_made | scenes_made or None, tuple(grades))
+    with told_when_unwritable(out, "choose another --out"):
         write_json(out / REPORT, report.to_json())
     return report
 
@@ -157,62 +160,39 @@ def make_graded_tracker(name: str, names: Sequence[str], settings: Sequence[str]
     return make_tracker(name, options)
 
 
-def _simulate(
-    names: Sequence[str],
-    seeds: range,
-    sensor: str,
-    size: tuple[int, int],
-    out: Path,
-    on_progress: Callable[[str], None],
-) -> tuple[list[Path], dict[str, Any]]:
-    """Record what is not there yet; the folders of all, and how they are made."""
+def _simulations(
+    names: Sequence[str], seeds: range, sensor: str, size: tuple[int, int], place: Path
+) -> tuple[list[GradedRecording], dict[str, Any]]:
+    """The recordings of tasks, and how those are made that are not there yet."""
+    if not names:
+        return [], {}
     load_mujoco()
     from flowlab.grading.simulate import SimulatedRecording, simulate_recording
     from flowlab.sim.tasks import tasks_named
 
     how = SimulatedRecording.with_camera(sensor, size)
-    folders = []
-    for task in tasks_named(names):
-        for seed in seeds:
-            folder = out / "recordings" / f"{task}-{seed}"
-            with _writing(out):
-                made = simulate_recording(folder, task, seed, how)
-            on_progress(f"{folder}: {'recorded' if made else 'there already'}")
-            folders.append(folder)
-    return folders, how.model_dump(mode="json")
+    recordings = [
+        GradedRecording(place / f"{task}-{seed}", partial(simulate_recording, task=task, seed=seed, settings=how))
+        for task in tasks_named(names)
+        for seed in seeds
+    ]
+    return recordings, {"tasks": how.model_dump(mode="json")}
 
 
-def _film(
-    names: Sequence[str],
-    seeds: range,
-    sensor: str | None,
-    size: tuple[int, int] | None,
-    out: Path,
-    on_progress: Callable[[str], None],
-) -> tuple[list[Path], dict[str, Any]]:
-    """Film what is not there yet; the folders of all, and how they are made."""
+def _films(
+    names: Sequence[str], seeds: range, sensor: str | None, size: tuple[int, int] | None, place: Path
+) -> tuple[list[GradedRecording], dict[str, Any]]:
+    """The films of families of scenes, and how those are made that are not there yet."""
+    if not names:
+        return [], {}
     load_mujoco()
     from flowlab.grading.scenes.families import FAMILIES
-    from flowlab.grading.scenes.film import FilmSettings, make_film
+    from flowlab.grading.scenes.film import FilmSettings, check_film, make_film
 
     how = FilmSettings(sensor=sensor, size=size)
-    folders = []
+    recordings = []
     for family in FAMILIES if list(names) == ["all"] else names:
-        for seed in seeds:
-            folder = out / "recordings" / f"{family}-{seed}"
-            with _writing(out):
-                made = make_film(folder, family, seed, how)
-            on_progress(f"{folder}: {'filmed' if made else 'there already'}")
-            folders.append(folder)
-    return folders, how.model_dump(mode="json")
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    """Say where it was that something could not be written."""
-    try:
-        yield
-    except FlowlabError:  # that a file to be read is missing is an OSError, too
-        raise
-    except OSError as error:
-        raise FlowlabError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error
+        check_film(family, how)
+        films = {seed: partial(make_film, family=family, seed=seed, settings=how) for seed in seeds}
+        recordings += [GradedRecording(place / f"{family}-{seed}", film) for seed, film in films.items()]
+    return recordings, {"scenes": how.model_dump(mode="json")}

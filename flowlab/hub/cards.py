@@ -8,7 +8,7 @@ import yaml
 from flowlab.data.mixture import dataset_shares
 from flowlab.hub.names import HubName
 from flowlab.hub.repo_layout import PICTURE
-from flowlab.policies.checkpoint import TrainedPolicy
+from flowlab.policies.trained import TrainedPolicy
 from flowlab.storage.card import without_mark
 from flowlab.storage.dataset import Dataset
 from flowlab.text import markdown, one_line

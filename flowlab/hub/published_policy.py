@@ -12,18 +12,10 @@ from flowlab.hub.local_paths import without_local_paths
 from flowlab.hub.names import HubName
 from flowlab.hub.published_dataset import Staged, pulled_from
 from flowlab.hub.repo_layout import CARD, CONFIG, PICTURE, WEIGHTS
-from flowlab.policies.checkpoint import (
-    CHECKPOINTS,
-    POLICY,
-    RUN,
-    TrainedPolicy,
-    checkpoint_name,
-    load_policy,
-    step_of,
-    validated,
-)
-from flowlab.policies.run_folder import read_run_config
+from flowlab.policies.checkpoint import load_policy
+from flowlab.policies.run_config import read_run_config
 from flowlab.policies.tensor_files import check_finite
+from flowlab.policies.trained import CHECKPOINTS, POLICY, RUN, TrainedPolicy, checkpoint_name, step_of, validated
 from flowlab.untrusted import read_json
 from flowlab.viz.training_metrics import METRICS
 

@@ -13,9 +13,8 @@ from flowlab.hub.connection import HubConnection
 from flowlab.hub.local_paths import told_names
 from flowlab.hub.names import HubName, Kind
 from flowlab.hub.published_dataset import Staged, stage_dataset
-from flowlab.hub.published_policy import stage_policy
 from flowlab.hub.repo_layout import check_counts, matches, our_patterns
-from flowlab.policies.checkpoint import CHECKPOINTS, POLICY
+from flowlab.policies.trained import CHECKPOINTS, POLICY
 from flowlab.storage.dataset import Dataset
 from flowlab.storage.manifest import MANIFEST
 from flowlab.text import shown
@@ -84,6 +83,8 @@ def planned_push(path: Path, repo: str, license_name: str | None = None) -> Iter
             if kind == "dataset":
                 staged = stage_dataset(Dataset(path), folder, name, license_name)
             else:
+                from flowlab.hub.published_policy import stage_policy  # with PyTorch
+
                 staged = stage_policy(path, folder, name, license_name)
         sizes = {str(f.relative_to(folder)): f.stat().st_size for f in sorted(folder.rglob("*")) if f.is_file()}
         check_counts(sizes, str(path))

@@ -8,14 +8,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from flowlab.data.batches import Batch, ObservationBatch
-from flowlab.data.normalizer import Scaler
+from flowlab.data.scaler import Scaler
 from flowlab.nets.denoiser import make_denoiser
 from flowlab.nets.diffusion import Diffusion, NoiseSampler
 from flowlab.nets.motion import MotionHead, MotionLoss
 from flowlab.nets.settings import MotionSettings
-from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
+from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork
 from flowlab.policies.observation_encoder import ObservationEncoder
 from flowlab.policies.settings import DiffusionPolicySettings
+from flowlab.policies.spec import PolicySpec
 
 
 class DiffusionPolicy(PolicyNetwork):

@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from flowlab.data.batches import Batch, ObservationBatch
-from flowlab.data.normalizer import Scaler
+from flowlab.data.scaler import Scaler
 from flowlab.nets.motion import ChannelFlowHead, PerQueryFlowHead, QueryEncoder
-from flowlab.policies.base import PolicySpec
 from flowlab.policies.diffusion_policy import MotionPolicy
 from flowlab.policies.settings import FDPSettings
+from flowlab.policies.spec import PolicySpec
 
 
 class FDP(MotionPolicy):

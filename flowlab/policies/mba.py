@@ -6,9 +6,9 @@ from torch import Tensor, nn
 
 from flowlab.data.batches import Batch
 from flowlab.nets.motion import PoseHead
-from flowlab.policies.base import PolicySpec
 from flowlab.policies.diffusion_policy import MotionPolicy
 from flowlab.policies.settings import MBASettings
+from flowlab.policies.spec import PolicySpec
 
 _CLIP = 2.0
 """Greatest normalized coordinate of a pose."""

@@ -5,10 +5,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from flowlab.data.batches import ObservationBatch
-from flowlab.data.normalizer import Scaler
+from flowlab.data.scaler import Scaler
 from flowlab.nets.encoder import PointNet, linear_layers
 from flowlab.nets.settings import EncoderSettings
-from flowlab.policies.base import PolicySpec
+from flowlab.policies.spec import PolicySpec
 
 _TASK_FEATURES = 32
 

@@ -4,8 +4,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowlab.policies.checkpoint import RUN, TrainedPolicy, checkpoint_files, read_trained, step_of
-from flowlab.policies.run_folder import read_run_config
+from flowlab.policies.run_config import read_run_config
+from flowlab.policies.trained import RUN, TrainedPolicy, checkpoint_files, read_trained, step_of
 
 
 @dataclass(frozen=True, slots=True)

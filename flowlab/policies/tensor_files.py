@@ -2,8 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,10 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from flowlab.checksums import with_checksum, without_checksum
-from flowlab.errors import DataError, MissingFileError, first_line
+from flowlab.checksums import with_checksum
+from flowlab.errors import DataError
 from flowlab.files import new_file
-from flowlab.limits import MAX_WEIGHTS_BYTES
-from flowlab.untrusted import check_regular, parse_json
-
-_ABOUT = "flowlab"
-"""Key under which a file of tensors says what it is."""
-_MOST_STEPS = 1 << 62
+from flowlab.policies.tensor_headers import ABOUT, metadata_of, step_in, understood
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
@@ -28,7 +22,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     told = json.dumps(with_checksum({**about, "tensors": _digest(plain)}))
     with new_file(path) as temporary:
-        about_all = {_ABOUT: told}  # under one key: several would come in any order
+        about_all = {ABOUT: told}  # under one key: several would come in any order
         temporary.write_bytes(save(plain, about_all))  # save_file has a temporary name of its own, which a kill leaves
 
 
@@ -59,37 +53,3 @@ def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
     for name, values in tensors.items():
         if values.is_floating_point() and not values.isfinite().all():
             raise DataError(f"{path}: '{name}' has values that are not finite; delete it, or restore it")
-
-
-def metadata_of(file: Any, where: str, advice: str) -> dict[str, Any]:
-    """What is said in a file of tensors; of one from an earlier version, its step. A :class:`KeyError` where flowlab
-    did not say it: a name that changed on disk must not pass for one that is left out."""
-    told: dict[str, str] = file.metadata() or {}
-    if told.keys() == {_ABOUT}:
-        return dict(without_checksum(parse_json(told[_ABOUT], where, advice), where, advice))
-    return {"step": told["step"]}
-
-
-def step_in(about: Mapping[str, Any]) -> int:
-    """The step that a file of tensors is of; where it tells none, what :func:`understood` turns into a sentence."""
-    told = about["step"]
-    step = int(told) if isinstance(told, str) or type(told) is int else -1  # a word in files of earlier versions
-    if not 0 <= step < _MOST_STEPS:
-        raise ValueError("no step")
-    return step
-
-
-@contextmanager
-def understood(path: Path, advice: str) -> Iterator[None]:
-    """Turns a failure to read weights into a sentence."""
-    try:
-        check_regular(path, MAX_WEIGHTS_BYTES)  # a pipe would be waited at for ever
-        yield
-    except MissingFileError as error:
-        raise DataError(f"{path}: there is no such checkpoint") from error
-    except DataError:
-        raise
-    except (KeyError, ValueError) as error:
-        raise DataError(f"{path}: not written by flowlab, or damaged (it does not tell its step); {advice}") from error
-    except (OSError, safetensors.SafetensorError) as error:
-        raise DataError(f"{path}: damaged ({first_line(error)}); {advice}") from error

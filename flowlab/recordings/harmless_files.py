@@ -5,7 +5,8 @@ from pathlib import Path, PurePosixPath
 
 from flowlab.errors import DataError
 from flowlab.recordings.image_files import COLOR_SUFFIXES
-from flowlab.untrusted import read_text
+from flowlab.recordings.recording_yaml import SIMULATED
+from flowlab.untrusted import read_json, read_text
 
 _PROSE = re.compile(
     r"(readme|licen[cs]e|notice|citation|changelog|authors|copying)([._-].*)?|.*\.(md|rst|pdf)", re.DOTALL
@@ -46,6 +47,8 @@ def why_harmless(name: str, path: Path | None) -> str | None:
         return None
     if _PROSE.fullmatch(file.name):
         return "documentation"
+    if name == SIMULATED and _is_of_simulator(path):
+        return "what flowlab's simulator made it with"
     if _SUMS.fullmatch(file.name):
         return "checksums"
     if file.name.endswith("~"):
@@ -55,6 +58,15 @@ def why_harmless(name: str, path: Path | None) -> str | None:
     if suffix in _FILMS or (suffix in COLOR_SUFFIXES and any(map(_PREVIEW.search, (*file.parts[:-1], file.stem)))):
         return "to look at"
     return "prose" if suffix in (".txt", ".log") and _is_prose(path, suffix) else None
+
+
+def _is_of_simulator(path: Path) -> bool:
+    """Whether flowlab wrote a file of that name; another's may say where the camera was."""
+    try:
+        values = read_json(path)
+    except DataError:
+        return False
+    return isinstance(values, dict) and values.keys() == {"made_with", "unusable_queries"}
 
 
 def _is_prose(path: Path, suffix: str) -> bool:

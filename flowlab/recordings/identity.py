@@ -3,8 +3,8 @@
 The identity is a text of two parts with a ``/`` between them: a digest of the files of the recording, and a digest of
 what is said of it (``recording.yaml`` and the calibration file as they are understood, and the reader). Small files are
 digested whole, of larger ones parts that are evenly spread: no two pictures of a sensor have the same noise, and those
-that are compressed end in a checksum. HDF5 is written in place, so it is digested whole, whatever its size. Times of
-files are not part of it, for copies have others.
+that are compressed end in a checksum. Numbers in HDF5, Parquet and NumPy's files can change without a change of size,
+so these are digested whole. Times of files are not part of it, for copies have others.
 """
 
 import hashlib
@@ -28,6 +28,8 @@ _PART = 4096
 """Bytes of each part of a large file."""
 _WHOLE = {True: 1 << 15, False: 1 << 22}
 """Bytes up to which a file is digested whole, by whether it is a picture."""
+_TABLES = (".npy", ".npz", ".parquet")
+"""Numbers, which somebody may put right without changing the size of the file."""
 _PARTS = 64
 """Most parts of a file; a picture has three."""
 _QUIET = 5
@@ -104,11 +106,12 @@ def _digest_files(path: Path, files: Iterable[FoundFile] | None) -> str:
 
 def _parts(file: FoundFile) -> Iterator[bytes]:
     """What of a file is digested."""
-    if is_hdf5(file.path):
+    suffix = file.path.suffix.lower()
+    if (file.size > _WHOLE[False] and suffix in _TABLES) or is_hdf5(file.path):
         about = file.path.stat()
         yield _whole(file.path, about.st_size, about.st_mtime_ns, about.st_ino)
         return
-    picture = file.path.suffix.lower() in {*COLOR_SUFFIXES, *DEPTH_SUFFIXES} - {".npy", ".npz"}
+    picture = suffix in {*COLOR_SUFFIXES, *DEPTH_SUFFIXES} - {*_TABLES}
     try:
         with file.path.open("rb", buffering=0) as opened:
             if file.size <= _WHOLE[picture]:

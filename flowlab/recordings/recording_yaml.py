@@ -18,6 +18,8 @@ from flowlab.untrusted import read_yaml
 FILE_NAME = "recording.yaml"
 TRUE_TRACKS = "ground_truth.npz"
 """What grading compares with, where a recording has it."""
+SIMULATED = "simulated.json"
+"""What flowlab's simulator keeps beside a recording of how it was made."""
 _FARTHEST_M = 1e6
 Row = tuple[float, float, float, float]
 

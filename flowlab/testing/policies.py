@@ -22,7 +22,8 @@ from flowlab.data.batches import Batch, ObservationBatch
 from flowlab.data.needs import Needs
 from flowlab.data.training_settings import TrainSettings
 from flowlab.nets.diffusion import NoiseSampler
-from flowlab.policies.base import ActionPlan, Losses, PolicyNetwork, PolicySpec
+from flowlab.policies.base import ActionPlan, Losses, PolicyNetwork
+from flowlab.policies.spec import PolicySpec
 from flowlab.testing.policy_problem import ACTION, PICTURE, Problem, make_problem
 
 STEPS = 60

@@ -13,8 +13,9 @@ from flowlab.data.needs import Needs
 from flowlab.data.normalizer import Normalizer, Scale
 from flowlab.data.replay_buffer import EpisodeSlice, ReplayBuffer
 from flowlab.data.window_sampler import index_windows
-from flowlab.policies.base import PolicyNetwork, PolicySpec
+from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.profiles import load_settings
+from flowlab.policies.spec import PolicySpec
 from flowlab.records import Role
 
 TASKS = ("pour", "roll")

@@ -7,7 +7,7 @@ from typing import Any
 
 from flowlab.files import write_atomically
 from flowlab.json_lines import append_line, line_of
-from flowlab.policies.checkpoint import resume_advice
+from flowlab.policies.trained import resume_advice
 from flowlab.training.loggers import MetricsLogger
 from flowlab.viz.training_metrics import METRICS, metrics_lines
 

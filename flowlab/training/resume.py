@@ -7,8 +7,10 @@ from flowlab.data.mixture import describe_mixture, without_names
 from flowlab.data.replay_buffer import load_buffer
 from flowlab.data.source import open_training_source
 from flowlab.errors import DataError
-from flowlab.policies.checkpoint import POLICY, RUN, build_policy, check_observer, read_trained
-from flowlab.policies.run_folder import check_positions, read_resume, read_run_config
+from flowlab.policies.checkpoint import build_policy, check_observer
+from flowlab.policies.run_config import check_positions, read_run_config
+from flowlab.policies.run_folder import read_resume
+from flowlab.policies.trained import POLICY, RUN, read_trained
 from flowlab.registry import names_from_file
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.loggers import check_loggers

@@ -22,15 +22,11 @@ from flowlab.data.split import split_episodes
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError, UsageError
 from flowlab.files import remove_leftovers
-from flowlab.policies.base import PolicyNetwork, PolicySpec, make_policy
-from flowlab.policies.checkpoint import (
-    TrainedPolicy,
-    check_observer,
-    load_policy,
-    read_trained,
-    writing_run,
-)
-from flowlab.policies.run_folder import RunConfig, has_begun, read_run_config
+from flowlab.policies.base import PolicyNetwork, make_policy
+from flowlab.policies.checkpoint import check_observer, load_policy
+from flowlab.policies.run_config import RunConfig, has_begun, read_run_config
+from flowlab.policies.spec import PolicySpec
+from flowlab.policies.trained import TrainedPolicy, read_trained, writing_run
 from flowlab.registry import POLICIES
 from flowlab.storage.manifest import differences
 from flowlab.training.distributed import ProcessGroup

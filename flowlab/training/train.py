@@ -11,8 +11,8 @@ from flowlab.arguments import check_count, check_minutes, check_names, check_opt
 from flowlab.data.mixture import check_weights, dataset_shares
 from flowlab.data.source import paths_of
 from flowlab.hub.pulling import local_sources
-from flowlab.policies.checkpoint import read_trained, writing_run
 from flowlab.policies.profiles import load_settings
+from flowlab.policies.trained import read_trained, writing_run
 from flowlab.storage.dataset import Dataset
 from flowlab.text import counted
 from flowlab.training.loggers import check_loggers

@@ -15,8 +15,10 @@ from flowlab.data.window_sampler import index_windows
 from flowlab.errors import DataError, FlowlabError
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import PolicyNetwork
-from flowlab.policies.checkpoint import TrainedPolicy, save_weights, writing_run
-from flowlab.policies.run_folder import Groups, RunConfig, lines_behind, save_resume, start_folder
+from flowlab.policies.checkpoint import save_weights
+from flowlab.policies.run_config import RunConfig
+from flowlab.policies.run_folder import Groups, lines_behind, save_resume, start_folder
+from flowlab.policies.trained import TrainedPolicy, writing_run
 from flowlab.training.distributed import ProcessGroup
 from flowlab.training.ema import EMA
 from flowlab.training.metrics import MetricsFile, RunningMeans

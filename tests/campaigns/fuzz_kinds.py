@@ -78,8 +78,8 @@ def _seal_tensors(file: Path) -> None:
     import safetensors
     from safetensors.torch import load_file
 
-    from flowlab.policies.checkpoint import POLICY, RUN, identity_in
     from flowlab.policies.tensor_files import write_tensors
+    from flowlab.policies.trained import POLICY, RUN, identity_in
 
     with safetensors.safe_open(file, "pt") as opened:
         about = json.loads(opened.metadata()["flowlab"])

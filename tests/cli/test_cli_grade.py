@@ -21,6 +21,18 @@ from flowlab.recordings.writing import write_rgbd_recording
 
 STEPS, WIDTH, HEIGHT = 12, 96, 72
 CAMERA = Camera.from_fovy(WIDTH, HEIGHT, 50.0, np.eye(4))
+EXAMPLES = Path(__file__).parents[2] / "examples"
+GLOOMY = """
+from flowlab.tracking.base import Tracker
+
+
+class Gloomy(Tracker):
+    name = "gloomy"
+    license = "none"
+
+    def open(self, clip):
+        raise RuntimeError("not today")
+"""
 SMALL = ("--size", "96x72", "--tracker", "lucas-kanade")
 
 
@@ -104,6 +116,39 @@ def test_trackers_side_by_side(slides: Path, tmp_path: Path, capsys: pytest.Capt
     assert [t["tracker"] for t in trackers] == ["lucas-kanade", "rigid-bodies"]
     assert trackers[0]["options"]["window"] == 9
     assert "rigid-bodies" in capsys.readouterr().out
+
+
+def figures(out: Path) -> Any:
+    """What a run found, but for the times it took."""
+    return json.loads((out / "grade.json").read_text(), object_hook=_without_times)
+
+
+def _without_times(values: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in values.items() if k not in ("cpu_s", "ms_per_frame")}
+
+
+def test_who_does_the_work_makes_no_difference(
+    slides: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    asked = (slides, "--tracker", "lucas-kanade", "--out")
+    run(*asked, tmp_path / "serial", "--engine", "09_own_engine:SerialEngine")
+    run(*asked, tmp_path / "local", "--workers", "2")
+    assert figures(tmp_path / "serial") == figures(tmp_path / "local")
+    assert sorted(p.name for p in (tmp_path / "local").iterdir()) == ["grade.json", "grade.png"], "no tracks are left"
+    assert "two: 12 frames; CPU time: lucas-kanade" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="no engine is called 'lokal'; did you mean local"):
+        run(*asked, tmp_path / "other", "--engine", "lokal")
+
+
+def test_a_tracker_that_fails_ends_it_with_its_own_words(
+    slides: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "gloomy.py").write_text(GLOOMY)
+    with pytest.raises(FlowlabError, match=r"one: could not be graded \(RuntimeError: not today\); no report was wri"):
+        run(slides / "one", "--tracker", "gloomy:Gloomy", "--out", tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
 
 
 @pytest.mark.slow

@@ -10,8 +10,9 @@ from builders import recorded, tiny_settings
 from synthetic import make_dataset, make_episode, with_tracks
 
 from flowlab.data.channels import ChannelSpec, infer_channels
-from flowlab.data.normalizer import Normalizer, Scale, Scaler, fit_normalizer
+from flowlab.data.normalizer import Normalizer, Scale, fit_normalizer
 from flowlab.data.replay_buffer import ReplayBuffer, load_buffer
+from flowlab.data.scaler import Scaler
 from flowlab.data.source import TrainingSource, open_training_source
 from flowlab.data.training_settings import TrainSettings
 from flowlab.errors import DataError

@@ -17,6 +17,14 @@ def test_the_page_is_what_the_code_says(page: str) -> None:
     assert (ROOT / "docs" / page).read_text() == write(), f"docs/{page} is not up to date; run make reference"
 
 
+def test_tables_of_settings_are_what_is_stacked_on_phones() -> None:
+    (around,) = re.findall(
+        r'<div class="(\w+)" markdown>\n\n.*\n</div>\n', (ROOT / "docs/settings.md").read_text(), re.DOTALL
+    )
+    on_phones = (ROOT / "docs/style.css").read_text().partition("@media screen and (max-width:")[2]
+    assert f".md-typeset .{around} :is(tbody, tr, td) {{ display: block; }}" in on_phones
+
+
 @pytest.mark.parametrize("page", WRITERS)
 def test_everything_is_explained(page: str) -> None:
     unexplained = re.findall(r"^\| (`[^|]+) .*\|  \|$", (ROOT / "docs" / page).read_text(), re.MULTILINE)

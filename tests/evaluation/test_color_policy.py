@@ -21,8 +21,10 @@ from flowlab.evaluation.rollout import SimulatorPool, roll_out
 from flowlab.evaluation.trials import Trial
 from flowlab.nets.diffusion import NoiseSampler
 from flowlab.policies.base import ActionPlan, Generators, Losses, PolicyNetwork, PolicySpec
-from flowlab.policies.checkpoint import TrainedPolicy, save_weights
-from flowlab.policies.run_folder import RunConfig, start_folder
+from flowlab.policies.checkpoint import save_weights
+from flowlab.policies.run_config import RunConfig
+from flowlab.policies.run_folder import start_folder
+from flowlab.policies.trained import TrainedPolicy
 from flowlab.records import Frame
 from flowlab.sim.recorder import EpisodeRecorder, TaskSimulator
 from flowlab.sim.scene_settings import CameraSettings, SceneSettings

@@ -49,7 +49,7 @@ def test_an_engine_of_ones_own_gives_the_same_episodes(run: Path, tmp_path: Path
     STARTED.clear()
     code, said, err = call_cli(capsys, "eval", mine, *asked, "--engine", "test_engines:InThisProcess")
     assert code == 0, err
-    assert STARTED == [{"workers": 1, "imports": ["flowlab.evaluation.evaluate"]}]
+    assert STARTED == [{"workers": 1, "imports": ["flowlab.evaluation.episode_batches"]}]
     code, wanted, err = call_cli(capsys, "eval", theirs, *asked)
     assert code == 0, err
     assert json.loads(said) == json.loads(wanted)
@@ -73,6 +73,14 @@ def test_the_function_is_what_the_command_calls(run: Path, tmp_path: Path, capsy
     before = (mine / LINES).stat().st_mtime_ns
     assert flowlab.evaluate([str(mine)], **asked) == [result]
     assert (mine / LINES).stat().st_mtime_ns == before
+
+
+def test_a_device_that_is_not_there_is_said(run: Path, tmp_path: Path, capsys: Capture) -> None:
+    mine = Path(shutil.copytree(run, tmp_path / "dp3"))
+    asked = ("eval", mine, "--task", "drawer-open", "--episodes", "1", "--engine", "test_engines:InThisProcess")
+    code, said, err = call_cli(capsys, *asked, "--device", "cuda:99")
+    assert (code, said) == (2, "")
+    assert "device is 'cuda:99', which PyTorch cannot use here; use cpu, cuda or cuda:1" in err
 
 
 @pytest.mark.parametrize("command", ["eval", "bench"])

@@ -21,8 +21,9 @@ from flowlab.evaluation.offline import OfflineReport, evaluate_offline
 from flowlab.evaluation.sampled_flow import DRAWS
 from flowlab.geometry.camera import Camera
 from flowlab.policies.base import ActionPlan, PolicyNetwork
-from flowlab.policies.checkpoint import LoadedPolicy, TrainedPolicy, load_policy
+from flowlab.policies.checkpoint import LoadedPolicy, load_policy
 from flowlab.policies.fdp import FDP
+from flowlab.policies.trained import TrainedPolicy
 from flowlab.records import Episode
 from flowlab.report.tables import demonstration_table, offline_table
 from flowlab.storage.dataset import Dataset

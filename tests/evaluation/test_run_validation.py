@@ -17,7 +17,7 @@ from flowlab.checksums import with_checksum
 from flowlab.evaluation.episode_log import append_result
 from flowlab.evaluation.results import EpisodeResult
 from flowlab.evaluation.validation import validate_run
-from flowlab.policies.checkpoint import FREE
+from flowlab.policies.trained import FREE
 
 Capture = pytest.CaptureFixture[str]
 OLD = Path(__file__).parents[1] / "fixtures/old/runs"

@@ -60,6 +60,21 @@ def test_a_cluster_makes_the_bytes_that_this_machine_makes(cluster: Any, tmp_pat
 
 
 @needs_ray
+def test_a_cluster_grades_as_this_machine_does(cluster: Any, tmp_path: Path) -> None:
+    found = []
+    for engine in "ray", "local":
+        asked = ["--scenes", "thin,plain", "--size", "96x72", "--tracker", "lucas-kanade", "--engine", engine, "--json"]
+        done = subprocess.run(
+            [sys.executable, "-m", "flowlab", "grade", *asked, "--out", str(tmp_path / engine)],
+            cwd=tmp_path, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        found.append([(r["recording"], r["metrics"]) for r in json.loads(done.stdout)["trackers"][0]["recordings"]])
+    assert found[0] == found[1]
+    assert [name for name, _ in found[0]] == ["thin-0", "plain-0"]
+
+
+@needs_ray
 def test_a_machine_that_is_killed_costs_no_episode(cluster: Any, tmp_path: Path) -> None:
     out = tmp_path / "data"
     with subprocess.Popen(extraction(out, "--episodes", "40", "--engine", "ray"), cwd=tmp_path) as running:

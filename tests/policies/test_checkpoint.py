@@ -42,7 +42,7 @@ from flowlab.data.window_sampler import index_windows
 from flowlab.errors import DataError
 from flowlab.policies.base import PolicyNetwork
 from flowlab.policies.checkpoint import load_policy
-from flowlab.policies.run_folder import RESUME
+from flowlab.policies.trained import RESUME
 from flowlab.storage.dataset import Dataset
 from flowlab.training import run as training_run
 from flowlab.training.trainer import Trainer

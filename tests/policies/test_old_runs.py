@@ -14,8 +14,9 @@ from synthetic import call_cli
 from flowlab.deployment.robot_policy import Policy
 from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
-from flowlab.policies.checkpoint import load_policy, read_trained
+from flowlab.policies.checkpoint import load_policy
 from flowlab.policies.migrations import migrate_tensor
+from flowlab.policies.trained import read_trained
 from flowlab.records import Frame
 from flowlab.training.metrics import last_metrics
 

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from dry_runs import dry_run
 from hdf5_files import GIVEN, POSE, STEPS, K, filmed
-from lerobot_files import CAMERA, COLOR, DEPTH, FPS, codes, v3, v21, write_video
+from lerobot_files import CAMERA, COLOR, DEPTH, FPS, TASK, codes, v3, v21, write_video
 from real_recordings import opened, write_yaml
 from synthetic import edit_json
 
@@ -231,6 +231,46 @@ def test_a_task_may_have_any_letters(tmp_path: Path) -> None:
     (path / "meta/episodes.jsonl").write_text(json.dumps(row, ensure_ascii=False) + "\n", encoding="utf-8")
     (one,) = find_recordings([path])
     assert opened(one).frame(0).rgb is not None
+
+
+def without_tasks(path: Path) -> Path:
+    """The same dataset, whose entries of episodes name no task."""
+    for file in path.glob("meta/episodes/*/*.parquet"):
+        edit_table(file, lambda c: c.pop("tasks"))
+    for file in path.glob("meta/episodes.jsonl"):
+        rows = [json.loads(line) | {"tasks": []} for line in file.read_text().splitlines()]
+        file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path
+
+
+@pytest.mark.parametrize("write", [v3, v21])
+def test_an_episode_without_words_has_those_of_its_steps(write: Write, tmp_path: Path, capsys: Capture) -> None:
+    path = without_tasks(write(tmp_path / "d", color="png"))
+    found = find_recordings([path])
+    assert [choose_reader(p).task(p) for p in found] == [f"{TASK} 0", f"{TASK} 1"]  # type: ignore[attr-defined]
+    run = dry_run(capsys, path / "episode_1")
+    assert (run.code, run.facts["task"], "task" in run.checks) == (0, f"{TASK} 1", False)
+
+
+def test_what_steps_say_of_tasks_is_told_where_it_is_odd(tmp_path: Path, capsys: Capture) -> None:
+    path = v3(tmp_path / "d", color="png")
+    table, half = path / "data/chunk-000/file-000.parquet", STEPS // 2
+    numbers = [0] * STEPS + [0] * STEPS
+    edit_table(table, lambda c: c.update(task_index=pa.array(numbers)))
+    says = f"meta/ says {TASK} 1, which is taken, and task_index of the steps {TASK} 0"
+    assert dry_run(capsys, path / "episode_1").checks["task"] == ("doubtful", says)
+    without_tasks(path)
+    numbers[STEPS:] = [1] * half + [0] * (STEPS - half)
+    edit_table(table, lambda c: c.update(task_index=pa.array(numbers)))
+    run = dry_run(capsys, path / "episode_1")
+    assert run.facts["task"] == f"{TASK} 1"
+    assert run.checks["task"] == ("assumed", f"has 2, of which the first is taken: {TASK} 1; {TASK} 0")
+    edit_table(table, lambda c: c.update(task_index=pa.array([7] * 2 * STEPS)))
+    run = dry_run(capsys, path / "episode_1")
+    assert run.checks["task"] == ("assumed", "task_index of the steps is 7, which meta/tasks does not name")
+    edit_table(table, lambda c: c.update(task_index=pa.array([np.nan] * 2 * STEPS)))
+    run = dry_run(capsys, path / "episode_1")
+    assert (run.code, run.problem.endswith("task_index holds float64, expected whole numbers")) == (3, True), run
 
 
 def test_rewards_are_left_out_without_a_question(tmp_path: Path, capsys: Capture) -> None:

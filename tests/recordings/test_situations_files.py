@@ -137,6 +137,24 @@ def test_what_is_known_to_be_harmless_is_listed(tmp_path: Path, capsys: Capture)
     assert all(word in says for word in ("documentation", "checksums", "to look at", "says what is used"))
 
 
+def test_what_the_simulator_notes_of_its_film_is_known_and_no_other_file_of_that_name(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    folder = write_folder(tmp_path / "r")
+    put(
+        folder,
+        "simulated.json",
+        {"made_with": {"task": "push", "seed": 0, "settings": {"fx": 3}}, "unusable_queries": 2},
+    )
+    _, checks, _ = looked_at(capsys, folder)
+    assert [(c["verdict"], "flowlab's simulator" in c["says"]) for c in checks if c["about"] == "left out"] == [
+        ("ok", True)
+    ]
+    put(folder, "simulated.json", {"made_with": "Blender", "fx": 251.5})
+    _, checks, _ = looked_at(capsys, folder)
+    assert doubts(checks, "simulated.json")
+
+
 def test_many_files_of_one_kind_are_one_question(tmp_path: Path, capsys: Capture) -> None:
     folder = write_folder(tmp_path / "r")
     for t in range(9):

@@ -156,3 +156,15 @@ def test_an_identity_is_of_content_alone(tmp_path: Path) -> None:
     assert difference(first, identity(tmp_path / "b/c", read)) == "its files"
     (one / "color/around").symlink_to(one)  # a circle ends
     assert identity(one, read) == first
+
+
+@pytest.mark.parametrize("name", ["depth.npy", "log.npz", "file-000.parquet"])
+def test_a_number_put_right_in_a_large_file_is_seen(name: str, tmp_path: Path) -> None:
+    """Its size stays the same, and it lies where no part of a large file is looked at otherwise."""
+    one = record(tmp_path / "a", frames=3)
+    (one / name).write_bytes(bytes(6 << 20))
+    before = identity(one, RecordingSettings())
+    with (one / name).open("r+b") as file:
+        file.seek((3 << 20) + 5000)
+        file.write(b"1")
+    assert difference(before, identity(one, RecordingSettings())) == "its files"

@@ -24,9 +24,10 @@ from flowlab.errors import DataError, UsageError
 from flowlab.evaluation.held_out import open_held_out
 from flowlab.hub.names import HubName
 from flowlab.hub.published_policy import finish_policy, stage_policy
-from flowlab.policies.checkpoint import FREE, load_policy
-from flowlab.policies.run_folder import check_positions, read_run_config
+from flowlab.policies.checkpoint import load_policy
+from flowlab.policies.run_config import check_positions, read_run_config
 from flowlab.policies.tensor_files import write_tensors
+from flowlab.policies.trained import FREE
 from flowlab.records import Episode
 from flowlab.storage.recorded import Recorded
 from flowlab.training.run import ComputeSettings, prepare_run

@@ -33,7 +33,7 @@ from trained_runs import (
 )
 
 from flowlab.policies.profiles import load_settings
-from flowlab.policies.run_folder import RESUME
+from flowlab.policies.trained import RESUME
 from flowlab.training import run as training_run
 from flowlab.training.resume import resume_run
 

@@ -28,11 +28,14 @@ is changed by `--set KEY=VALUE`, once for each, where KEY is what the table show
 `--set observer.points=512`, `--set 'encoder.widths=[64, 128]'`. In files of your own ([recipes](stages.md),
 [profiles](training.md)) the same names are keys. What is unknown or does not fit is refused, never ignored.
 """
+_BEGIN, _END = '<div class="settings" markdown>\n', "</div>\n"
+"""Around the tables, which docs/style.css stacks on phones."""
 
 
 def settings_page() -> str:
     """The page, as Markdown."""
-    return "\n".join([_INTRO, *_stages(), *_trackers(), *_training(), *_others()])
+    sections = [*_stages(), *_trackers(), *_training(), *_others()]
+    return "\n".join([_INTRO, _BEGIN, *sections, _END])
 
 
 def _stages() -> Iterator[str]:

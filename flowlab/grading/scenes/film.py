@@ -62,12 +62,17 @@ def make_film(folder: Path, family: str, seed: int, settings: FilmSettings = Fil
         UsageError: There is no such family or sensor.
         DataError: Something else is in the way, or there is no point to grade.
     """
+    check_film(family, settings)
+    made_with = {"scenes": family, "seed": seed, "settings": json.loads(settings.model_dump_json())}
+    return made_once(folder, made_with, partial(_film, FAMILIES[family], seed, settings))
+
+
+def check_film(family: str, settings: FilmSettings) -> None:
+    """Raise :class:`UsageError` where there is no such family or sensor."""
     if family not in FAMILIES:
         raise unknown_name("family of scenes", family, FAMILIES)
     if settings.sensor is not None and settings.sensor not in PRESETS:
         raise unknown_name("sensor", settings.sensor, PRESETS)
-    made_with = {"scenes": family, "seed": seed, "settings": json.loads(settings.model_dump_json())}
-    return made_once(folder, made_with, partial(_film, FAMILIES[family], seed, settings))
 
 
 def _film(family: Family, seed: int, settings: FilmSettings, into: Path) -> int:

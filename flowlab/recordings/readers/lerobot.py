@@ -23,17 +23,18 @@ from flowlab.recordings.readers.lerobot_episodes import (
 )
 from flowlab.recordings.readers.lerobot_pictures import NEAREST, picture_files, read_pictures
 from flowlab.recordings.readers.lerobot_process import ask
+from flowlab.recordings.readers.lerobot_tasks import COLUMN, rows_of, task_checks, tasks_of
 from flowlab.recordings.recording_yaml import Metadata
 from flowlab.recordings.sample_files import to_float32
 from flowlab.recordings.stamps import Timing
 from flowlab.recordings.unused_files import is_ignored, some_of
 from flowlab.recordings.verdicts import Check, Verdict
-from flowlab.text import cut, shown
+from flowlab.text import shown
 
 STATE, ACTION, SUCCESS = "observation.state", "action", "next.success"
 TIME, POSES = "observation.time", "observation.T_world_cam"
 """When a step truly was [s], and where the camera was: columns that flowlab's own exporter writes."""
-_COUNTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_COUNTS = ("timestamp", "frame_index", "episode_index", "index", COLUMN)
 
 
 class LeRobotReader:
@@ -59,13 +60,13 @@ class LeRobotReader:
 
     def task(self, path: Path) -> str | None:
         """What the dataset says is done in an episode."""
-        return next(iter(one_episode(path, *split_path(path)).tasks), None)
+        return next(iter(tasks_of(one_episode(path, *split_path(path)))), None)
 
     def read(self, path: Path, given: Metadata) -> Streams:
         """The streams of an episode."""
         one = one_episode(path, *split_path(path))
         camera = choose_camera(one, given.camera)
-        first, last = _rows(one)
+        first, last = rows_of(one)
         numbers = _numbers(one, first, last)
         stamps = _stamps(one, numbers)
         time_s = np.ascontiguousarray(numbers.get(TIME, stamps).reshape(-1), np.float64)
@@ -81,27 +82,10 @@ class LeRobotReader:
             known=(*known_calibration(one, camera), *depth.known, *_told(one, numbers)),
             registered=is_registered(camera),
             poses=_poses(one, numbers, time_s, timing),
-            checks=(*camera.checks, *depth.checks, *_of_tasks(one), _left_out(unread, given)),
+            checks=(*camera.checks, *depth.checks, *task_checks(one), _left_out(unread, given)),
             used=("meta", "data", "videos"),
             unread=unread,
         )
-
-
-def _rows(one: LeRobotEpisode) -> tuple[int, int]:
-    """The first row of an episode in its table, and the one after its last."""
-    index = ask(one.data, "columns", ["episode_index"]).get("episode_index")
-    if index is None:
-        if one.info.is_v3:
-            raise DataError(f"{one.data}: has no column episode_index, so it does not say which rows are whose")
-        index = np.full(ask(one.data, "count"), one.index)
-    rows = np.flatnonzero(index.reshape(-1) == one.index)
-    if len(rows) != one.length:
-        raise DataError(
-            f"{one.data}: has {len(rows):,} rows of {one.where.name}, and meta/ says it has {one.length:,} steps"
-        )
-    if rows[-1] - rows[0] + 1 != len(rows):
-        raise DataError(f"{one.data}: has rows of other episodes between those of {one.where.name}")
-    return int(rows[0]), int(rows[-1]) + 1
 
 
 def _numbers(one: LeRobotEpisode, first: int, last: int) -> dict[str, np.ndarray]:
@@ -166,8 +150,8 @@ def _told(one: LeRobotEpisode, numbers: dict[str, np.ndarray]) -> Iterator[tuple
     """Rate, task and success, as far as the dataset tells."""
     known: dict[str, Any] = {} if TIME in numbers else {"fps": one.info.fps}
     yield one.info.place.name, Metadata(**known)
-    if one.tasks:
-        yield "meta/tasks", Metadata(task=one.tasks[0])
+    if tasks := tasks_of(one):
+        yield "meta/tasks", Metadata(task=tasks[0])
     success = one.said.get("success")
     if success is not None:
         yield "success of meta/episodes", Metadata(success=_truth(f"{one.where}: success of meta/episodes", success))
@@ -181,13 +165,6 @@ def _truth(where: str, value: Any) -> bool:
     if not isinstance(value, bool | int | float) or value not in (0, 1):
         raise DataError(f"{where} is {shown(value)}, expected true or false, or 1 or 0")
     return bool(value)
-
-
-def _of_tasks(one: LeRobotEpisode) -> Iterator[Check]:
-    """What is said where an episode has several tasks."""
-    if len(one.tasks) > 1:
-        says = f"has {len(one.tasks)}, of which the first is taken: {cut('; '.join(one.tasks))}"
-        yield Check("task", Verdict.ASSUMED, says)
 
 
 def _unread(one: LeRobotEpisode, used: Collection[str]) -> tuple[str, ...]:

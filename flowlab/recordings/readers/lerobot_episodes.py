@@ -32,8 +32,16 @@ class LeRobotEpisode:
     index: int
     length: int
     tasks: tuple[str, ...]
+    """What is done in it, in the words of its entry; see :mod:`.lerobot_tasks`, too."""
+    task_words: Mapping[int, str]
+    """Of every task of the dataset, by its number."""
     said: Mapping[str, Any]
     """Everything that is said of it."""
+
+    @property
+    def only_task(self) -> tuple[str, ...]:
+        """The dataset's task, where it has a single one."""
+        return tuple(self.task_words.values()) if len(self.task_words) == 1 else ()
 
     @property
     def where(self) -> Path:
@@ -116,7 +124,7 @@ def _read(folder: Path, state: tuple[Any, ...]) -> Mapping[str, LeRobotEpisode]:
         length = _whole(place, row, "length", 1 << 62)
         if not 0 < length <= MAX_FILES:
             raise DataError(f"{place}: says the episode {index} has {length:,} steps, expected 1 to {MAX_FILES:,}")
-        found[index] = LeRobotEpisode(info, index, length, _texts(row.get("tasks"), texts), row)
+        found[index] = LeRobotEpisode(info, index, length, _words(row.get("tasks"), texts), texts, row)
     if info.total_episodes is not None and info.total_episodes != len(found):
         told = _EPISODES[0 if info.is_v3 else 1]
         raise DataError(
@@ -151,12 +159,11 @@ def _tasks(folder: Path, files: Sequence[Path]) -> Iterator[tuple[int, str]]:
                 yield _whole(file, row, "task_index"), words
 
 
-def _texts(tasks: Any, texts: Mapping[int, str]) -> tuple[str, ...]:
-    """What is done in an episode, in words; where there are none, what is done in the whole dataset."""
+def _words(tasks: Any, texts: Mapping[int, str]) -> tuple[str, ...]:
+    """What the entry of an episode says is done in it."""
     said = tasks if isinstance(tasks, list) else [tasks]
     words = [texts.get(x, "") if isinstance(x, int) else x for x in said]
-    found = [x for x in words if isinstance(x, str) and x.strip()]
-    return tuple(dict.fromkeys(found)) or (tuple(texts.values()) if len(texts) == 1 else ())
+    return tuple(dict.fromkeys(x for x in words if isinstance(x, str) and x.strip()))
 
 
 def _parquet_rows(file: Path) -> Iterator[dict[str, Any]]:
