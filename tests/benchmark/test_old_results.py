@@ -71,11 +71,17 @@ def test_units_made_before_are_those_of_todays_recipe() -> None:
         == {f"assembly-{policy}" for policy in ("fdp", "dp3", "mba")}
     )
     longer = load_experiment(
-        "table1", tasks=("assembly",), set=("run.validations=1", "n_action_steps=8", "motion.summary=mixed"), policies=("fdp",)
+        "table1",
+        tasks=("assembly",),
+        set=("run.validations=1", "n_action_steps=8", "motion.summary=mixed"),
+        policies=("fdp",),
     )
     assert known_results(longer, plan_units(longer), made)
     other = load_experiment(
-        "table1", tasks=("assembly",), set=("run.validations=1", "n_action_steps=8", "encoder.scale=axes"), policies=("dp3",)
+        "table1",
+        tasks=("assembly",),
+        set=("run.validations=1", "n_action_steps=8", "encoder.scale=axes"),
+        policies=("dp3",),
     )
     with pytest.raises(DataError, match=r"encoder\.scale"):
         known_results(other, plan_units(other), made)

@@ -33,7 +33,8 @@ from flowlab.sim.scene_settings import CameraSettings, SceneSettings
 Capture = pytest.CaptureFixture[str]
 TASK = "drawer-open"
 SHORT = "--profile", str(NETWORK), *options(
-    "n_action_steps=8", "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=0", "diffusion.inference_steps=2"
+    "n_action_steps=8", "run.minutes=null", "run.steps=2", "run.checkpoints=2", "run.validations=0",
+    "diffusion.inference_steps=2",
 )  # fmt: skip
 PLACE = "evaluation/step-00000002-execute-8/episodes.jsonl"
 SIX = ("--task", TASK, "--seeds", 0, "--episodes", 6)
