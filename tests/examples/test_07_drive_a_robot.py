@@ -15,9 +15,9 @@ def run(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(small_dataset, "--policy", "fdp", *SMALL, "--out", out)
 
 
-def test_it_plans_every_eighth_step_and_tells_the_outcome(run: Path) -> None:
+def test_it_plans_every_fourth_step_and_tells_the_outcome(run: Path) -> None:
     output = run_example("07_drive_a_robot.py", run, "drawer-open")
     planned = [int(step) for step in re.findall(r"step (\d+): a new plan", output)]
-    assert planned == list(range(0, 200, 8))[: len(planned)]
+    assert planned == list(range(0, 200, 4))[: len(planned)]
     assert len(planned) > 1
     assert re.search(r"drawer-open: (not )?solved after \d+ steps", output)
