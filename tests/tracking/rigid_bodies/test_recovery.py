@@ -69,3 +69,20 @@ def test_its_twin_that_stood_there_from_the_start_is_not_taken_for_it() -> None:
     seen = scene([moving_planes.wall(1.2, FRAMES), plate(leaving(OUT_OF_VIEW), 1), plate(twin, 1)])
     away = np.linalg.norm(followed(seen).apply(START[None])[:, 0] - twin, axis=1)
     assert away[BACK].min() > 0.15
+
+
+class PlainPlate(moving_planes.Plate):
+    """A plate of one color."""
+
+    def texture(self) -> np.ndarray:
+        return np.full((8, 8, 3), (60, 120, 200), np.float32)
+
+
+def test_what_is_far_too_small_to_look_as_it_did_is_not_taken_for_it() -> None:
+    """A room of its color is seen three times as far away, where few pixels would show it, and any would do."""
+    turn = np.tile(np.eye(3), (FRAMES, 1, 1))
+    far = np.tile(OUT_OF_VIEW, (FRAMES, 1))
+    far[BACK] = 3 * (START + np.array([0.25, 0.1, 0.0]))
+    body, room = PlainPlate(SIZE, turn, leaving(OUT_OF_VIEW), 1), PlainPlate((1.2, 1.2), turn, far, 1)
+    seen = scene([moving_planes.wall(4.0, FRAMES), body, room])
+    assert followed(seen).apply(START[None])[BACK, 0, 2].max() < 1.7

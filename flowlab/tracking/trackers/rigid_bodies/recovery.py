@@ -12,6 +12,9 @@ LOST_ENERGY = 0.9
 """A body of a higher energy is not where it is said to be."""
 _FOUND_ENERGY, _FOUND_SEEN = 0.5, 0.6
 """What a place must be better than to be a lost body's: most of the body is seen there, and looks as it did."""
+_CLOSER = 2.0
+"""A body that is this much farther away or nearer than at first is too small or large in the picture to look as it did;
+of a thing of few pixels, anything far away does."""
 _STEP = 4
 """Every how many pixels, both ways, a place is tried."""
 _LIKE, _AS_BEFORE = 0.6, 0.35
@@ -77,7 +80,8 @@ def _new_places(batch: BodyBatch, t: int, k: int) -> Float64[np.ndarray, "n 3"]:
     j, i = np.rint(pictures.project(middle)).astype(int).clip(0, [width - 1, height - 1])
     like = _unlike(now[v, u], first[i, j]) < _LIKE
     like |= _unlike(pictures.feature[t, v, u, 1:], pictures.feature[0, i, j, 1:]) < _LIKE
-    like &= pictures.depth[t, v, u] > 0
+    z = pictures.depth[t, v, u]
+    like &= (z > middle[2] / _CLOSER) & (z < middle[2] * _CLOSER)
     u, v = u[like], v[like]
     xyz = pictures.unproject(np.stack([u, v], -1).astype(float), pictures.depth[t, v, u].astype(float))
     return xyz[~_stood_there(pictures, t, xyz, pictures.feature[t, v, u, 1:])]
