@@ -155,7 +155,7 @@ class Bench:
         """The run of a policy, made where it is not there."""
         run, (policy, more) = self.out / "runs" / f"{task}-{count}-{kind}-{seed}", KINDS[kind]
         began = time.process_time()
-        settings = [*TRAINING, f"run.steps={self.steps}", "run.checkpoints=1", *more]
+        settings = [*TRAINING, f"run.steps={self.steps}", "run.checkpoints=1", "n_action_steps=8", *more]
         flowlab.train(self.data(task, count), run, policy=policy, settings=settings, seed=seed, device="cpu")
         if (spent := time.process_time() - began) > 5:
             write_json(run / "cpu.json", {"train_cpu_s": round(spent)})
