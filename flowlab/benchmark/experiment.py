@@ -11,10 +11,10 @@ from typing import Any
 
 from flowlab.benchmark.recipe import ExperimentRecipe, curve_trials, final_trials
 from flowlab.benchmark.results import read_result, unit_path, write_result
-from flowlab.benchmark.units import ExperimentUnit, plan_units, sampling_of, share_of_units
+from flowlab.benchmark.units import ExperimentUnit, plan_units, receipts_of, sampling_of, share_of_units
 from flowlab.data.training_settings import TrainSettings
 from flowlab.engines.base import StartEngine, engine_by_name
-from flowlab.errors import DataError, UnfinishedError
+from flowlab.errors import DataError
 from flowlab.evaluation.checkpoints import find_checkpoints
 from flowlab.evaluation.episode_batches import evaluate_here
 from flowlab.evaluation.results import PolicyResult
@@ -32,7 +32,6 @@ from flowlab.training import run
 _LOG = logging.getLogger(__name__)
 RUNS = "runs"
 """Folder of an experiment that holds its training runs; of a finished unit, none is needed any more."""
-StartUnits = StartEngine[ExperimentUnit, str]
 OnProgress = Callable[[Sequence[PolicyResult], int, int], None]
 """Told results that have just come, how many there are, and how many there will be."""
 
@@ -70,13 +69,16 @@ def run_experiment(
     report = on_progress or (lambda fresh, done, of: None)
     known = known_results(recipe, units, out)
     todo = [u for u in share_of_units(units, shard) if u.name not in known]
-    start_engine: StartUnits = engine_by_name(engine, workers, [__name__])
+    start_engine: StartEngine[ExperimentUnit, str] = engine_by_name(engine, workers, [__name__])
     for name in known:
         _discard_run(recipe, out, name)  # a kill may have left it
     _extract(recipe, todo, out, engine, workers)
     report(list(known.values()) if todo else [], len(known), len(units))
     if todo:
-        _run_units(recipe, todo, out, start_engine, known, lambda r: report([r], len(known), len(units)))
+        with start_engine(partial(run_unit, recipe, out)) as running:
+            for name in receipts_of(running, todo, "unit"):
+                known[name] = read_result(unit_path(out, name))
+                report([known[name]], len(known), len(units))
     return [known[u.name] for u in units if u.name in known]
 
 
@@ -104,32 +106,6 @@ def run_unit(recipe: ExperimentRecipe, out: Path, unit: ExperimentUnit) -> str:
     write_result(unit_path(out, unit.name), result.model_copy(update=renamed))
     _discard_run(recipe, out, unit.name)
     return unit.name
-
-
-def _run_units(
-    recipe: ExperimentRecipe,
-    todo: Sequence[ExperimentUnit],
-    out: Path,
-    start_engine: StartUnits,
-    known: dict[str, PolicyResult],
-    on_result: Callable[[PolicyResult], None],
-) -> None:
-    """Do units, and add their results to those that are known."""
-    failures = []
-    with start_engine(partial(run_unit, recipe, out)) as engine:
-        for unit in todo:
-            engine.submit(unit)
-        for _ in todo:
-            ended = engine.next_result()
-            if ended.receipt is None:
-                failures.append(f"{ended.unit.name}: {ended.failure.strip().splitlines()[-1]}")
-                continue
-            known[ended.receipt] = read_result(unit_path(out, ended.receipt))
-            on_result(known[ended.receipt])
-    if failures:
-        raise UnfinishedError(
-            f"{counted(len(failures), 'unit')} failed, the first {failures[0]}; the same command tries again"
-        )
 
 
 def _discard_run(recipe: ExperimentRecipe, out: Path, name: str) -> None:

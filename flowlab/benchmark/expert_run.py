@@ -8,14 +8,13 @@ from pathlib import Path
 
 from flowlab.benchmark.expert_results import ExpertResult, expert_path, merge_experts, read_expert, write_expert
 from flowlab.benchmark.recipe import ExperimentRecipe, expand_tasks, final_trials
+from flowlab.benchmark.units import receipts_of
 from flowlab.config import Settings
 from flowlab.engines.base import StartEngine, engine_by_name
-from flowlab.errors import UnfinishedError
 from flowlab.evaluation.expert_rollout import roll_out_expert
 from flowlab.evaluation.trials import Trial
 from flowlab.files import locked
 from flowlab.pipeline.units import JobShard
-from flowlab.text import counted
 
 _SIMULATOR = ("metaworld", "mujoco")
 
@@ -53,21 +52,10 @@ def run_experts(
     """
     todo = missing_trials(recipe, out, shard)
     start: StartEngine[ExpertUnit, str] = engine_by_name(engine, workers, [__name__])
-    failures = []
     if todo:
         with start(partial(run_expert_unit, out)) as running:
-            for unit in todo:
-                running.submit(unit)
-            for _ in todo:
-                ended = running.next_result()
-                if ended.receipt is None:
-                    failures.append(f"{ended.unit.name}: {ended.failure.strip().splitlines()[-1]}")
-                else:
-                    on_result(read_expert(expert_path(out, ended.receipt)))
-    if failures:
-        raise UnfinishedError(
-            f"{counted(len(failures), 'task')} failed, the first {failures[0]}; the same command tries again"
-        )
+            for task in receipts_of(running, todo, "task"):
+                on_result(read_expert(expert_path(out, task)))
     paths = [expert_path(out, task) for task in expand_tasks(recipe.tasks)]
     return [read_expert(path) for path in paths if path.exists()]
 

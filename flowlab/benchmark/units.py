@@ -2,13 +2,14 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from flowlab.benchmark.recipe import ExperimentRecipe, PolicyVariant, expand_tasks, final_trials
 from flowlab.config import Settings
 from flowlab.data.training_settings import TrainSettings
-from flowlab.engines.base import core_count
-from flowlab.errors import UsageError, unknown_name
+from flowlab.engines.base import Engine, core_count
+from flowlab.errors import UnfinishedError, UsageError, unknown_name
 from flowlab.pipeline.units import JobShard
 from flowlab.policies.profiles import AnyTrainSettings, load_settings
 from flowlab.registry import POLICIES
@@ -47,6 +48,22 @@ def plan_units(recipe: ExperimentRecipe) -> list[ExperimentUnit]:
         if times > 1:
             raise UsageError(f"experiment {recipe.name}: {times} units are called {name}; give every variant a name")
     return units
+
+
+def receipts_of(engine: Engine[Any, str], units: Sequence[Any], what: str) -> Iterator[str]:
+    """Have an engine do units that have names, and hand back their receipts as they come.
+
+    Raises :class:`UnfinishedError` in the end where some failed; ``what`` is what one of them is.
+    """
+    failures = []
+    for ended in engine.results_of(units):
+        if ended.receipt is None:
+            failures.append(f"{ended.unit.name}: {ended.reason}")
+        else:
+            yield ended.receipt
+    if failures:
+        failed = counted(len(failures), what)
+        raise UnfinishedError(f"{failed} failed, the first {failures[0]}; the same command tries again")
 
 
 def plan_cost(recipe: ExperimentRecipe, units: int, workers: int | None = None) -> str:

@@ -2,7 +2,7 @@
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +33,11 @@ class UnitResult(Generic[Unit, Receipt]):
     receipt: Receipt | None
     failure: str = ""
     """Traceback, or how the worker died."""
+
+    @property
+    def reason(self) -> str:
+        """The last line of the failure, for a sentence about it."""
+        return self.failure.strip().splitlines()[-1]
 
 
 class Engine(ABC, Generic[Unit, Receipt]):
@@ -75,6 +80,13 @@ class Engine(ABC, Generic[Unit, Receipt]):
             FlowlabError: Work raised it, so that going on is useless; :class:`OSError` likewise. Any other error of
                 work is the failure of its unit.
         """
+
+    def results_of(self, units: Sequence[Unit]) -> Iterator[UnitResult[Unit, Receipt]]:
+        """Start all units, and hand back what became of each as it ends. Raises what :meth:`next_result` does."""
+        for unit in units:
+            self.submit(unit)
+        for _ in units:
+            yield self.next_result()
 
 
 StartEngine = Callable[[Callable[[Unit], Receipt]], AbstractContextManager[Engine[Unit, Receipt]]]

@@ -136,16 +136,13 @@ def _run_batches(
     on_progress(done, total)
     failures = []
     with start_engine(run_batch) as engine:
-        for batch in batches:
-            engine.submit(batch)
-        for _ in batches:
-            ended = engine.next_result()
+        for ended in engine.results_of(batches):
             if ended.receipt is None:
-                failures.append(ended.failure.strip())
+                failures.append(ended.reason)
             done += ended.receipt or 0
             on_progress(done, total)
     if failures:
         raise UnfinishedError(
-            f"{total - done} of {counted(total, 'episode')} could not be tried; the first failure: "
-            f"{failures[0].splitlines()[-1]}; the same command tries them again"
+            f"{total - done} of {counted(total, 'episode')} could not be tried; the first failure: {failures[0]}; "
+            f"the same command tries them again"
         )

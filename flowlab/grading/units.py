@@ -87,12 +87,11 @@ def grade_on_engine(
         units = [GradingUnit(r, tuple(trackers), chunks, p) for r, p in zip(recordings, places, strict=True)]
         rows: dict[Path, list[RecordingGrade]] = {}
         with start(run_grading_unit) as running:
-            for unit in units:
-                running.submit(unit)
-            for _ in units:
-                ended = running.next_result()
+            for ended in running.results_of(units):
                 if ended.receipt is None:
-                    raise FlowlabError(_failure(ended.unit, ended.failure))
+                    raise FlowlabError(
+                        f"{ended.unit.recording.folder}: could not be graded ({ended.reason}); no report was written"
+                    )
                 rows[ended.unit.tracks] = _rows(ended.unit, ended.receipt)
                 on_progress(_said(ended.unit, ended.receipt, len(rows[ended.unit.tracks][0].estimate.xyz_cam)))
     return [summarize_rows(t, [rows[p][k] for p in places]) for k, t in enumerate(trackers)]
@@ -131,8 +130,3 @@ def _said(unit: GradingUnit, receipt: GradingReceipt, frames: int) -> str:
     made = "" if unit.recording.make is None else f"{'recorded' if receipt.made else 'there already'}, "
     times = ", ".join(f"{t.name} {s:.1f} s" for t, s in zip(unit.trackers, receipt.cpu_s, strict=True))
     return f"{folder}: {made}{counted(frames, 'frame')}; CPU time: {times}"
-
-
-def _failure(unit: GradingUnit, failure: str) -> str:
-    """The sentence for a unit that failed."""
-    return f"{unit.recording.folder}: could not be graded ({failure.strip().splitlines()[-1]}); no report was written"

@@ -117,6 +117,19 @@ def bench(capsys: Capture, out: Path, recipe: Path, *more: str) -> tuple[int, st
     return call_cli(capsys, "bench", "--out", out, "--recipe", recipe, *more)
 
 
+def test_a_unit_that_failed_is_told_and_the_others_are_done(
+    experiment: Path, recipe: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = Path(shutil.copytree(experiment, tmp_path / "tiny"))
+    for name in UNITS[:2]:
+        for file in out.glob(f"units/{name}.*"):
+            file.unlink()
+    code, said, err = bench(capsys, out, recipe, "--engine", "failing_engine:FirstFails")
+    sentence = f"flowlab: 1 unit failed, the first {UNITS[0]}: ValueError: low tide; the same command tries again"
+    assert (code, said, err.splitlines()[-1]) == (4, "", sentence)
+    assert sorted(p.stem for p in out.glob("units/*.json")) == UNITS[1:]
+
+
 def test_every_policy_is_trained_and_evaluated_on_the_same_episodes(experiment: Path) -> None:
     assert sorted(p.name for p in experiment.iterdir() if p.is_dir() and p.name != "figures") == [
         "data", "runs", "units",

@@ -69,6 +69,20 @@ def test_the_expert_does_as_in_demonstrations_on_the_layouts_of_policies(
     assert files_below(tmp_path) == before
 
 
+def test_a_task_that_failed_is_told_and_tried_again(tmp_path: Path, capsys: Capture) -> None:
+    recipe, out = tmp_path / "two.yaml", tmp_path / "out"
+    recipe.write_text(yaml.safe_dump(RECIPE | {"tasks": ["reach", "push"], "seeds": [0], "episodes": 1}))
+    ask: list[Any] = ["bench", "--recipe", recipe, "--out", out, "--expert"]
+    code, said, err = call_cli(capsys, *ask, "--engine", "failing_engine:FirstFails")
+    sentence = "flowlab: 1 task failed, the first reach: ValueError: low tide; the same command tries again"
+    assert (code, said, err.splitlines()[-1]) == (4, "", sentence)
+    assert [p.name for p in out.glob("expert/*.json")] == ["push.json"]
+    before = (out / "expert/push.json").stat().st_mtime_ns
+    code, said, _ = call_cli(capsys, *ask, "--json", "--workers", "1")
+    assert (code, [r["task"] for r in json.loads(said)]) == (0, ["reach", "push"])
+    assert (out / "expert/push.json").stat().st_mtime_ns == before
+
+
 def test_options_about_policies_are_refused(tmp_path: Path, recipe: Path, capsys: Capture) -> None:
     code, _, err = call_cli(
         capsys, "bench", "--recipe", recipe, "--out", tmp_path, "--expert", "--budget", "9m", "--policies", "fdp"

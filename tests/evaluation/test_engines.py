@@ -75,6 +75,22 @@ def test_the_function_is_what_the_command_calls(run: Path, tmp_path: Path, capsy
     assert (mine / LINES).stat().st_mtime_ns == before
 
 
+def test_episodes_whose_worker_failed_are_told_and_tried_again(run: Path, tmp_path: Path, capsys: Capture) -> None:
+    mine = Path(shutil.copytree(run, tmp_path / "dp3"))
+    asked = ("eval", mine, "--task", "drawer-open", "--seeds", "0,1", "--episodes", "3", "--workers", "1")
+    code, said, err = call_cli(capsys, *asked, "--engine", "failing_engine:FirstFails")
+    assert (code, said) == (4, "")
+    left, _, sentence = err.splitlines()[-1].removeprefix("flowlab: ").partition(" of ")
+    assert sentence == (
+        "6 episodes could not be tried; the first failure: ValueError: low tide; the same command tries them again"
+    )
+    done = (mine / LINES).read_text()
+    assert done.count("\n") == 6 - int(left) > 0, "the other units were done"
+    assert call_cli(capsys, *asked)[0] == 0
+    assert (mine / LINES).read_text().startswith(done), "what was done is left alone"
+    assert (mine / LINES).read_text().count("\n") == 6
+
+
 def test_a_device_that_is_not_there_is_said(run: Path, tmp_path: Path, capsys: Capture) -> None:
     mine = Path(shutil.copytree(run, tmp_path / "dp3"))
     asked = ("eval", mine, "--task", "drawer-open", "--episodes", "1", "--engine", "test_engines:InThisProcess")
