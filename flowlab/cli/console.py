@@ -128,6 +128,7 @@ class ProgressBar:
         self._task = self._bar.add_task("starting", total=None, note="")
         self._start = self._last_line = time.monotonic()
         self._done_at_start: int | None = None
+        self._shown = 0, 0
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -139,12 +140,19 @@ class ProgressBar:
         PULSE.bars -= not self._bar.disable
 
     def update(self, done: int, total: int, what: str, note: str = "") -> None:
-        """Show that ``done`` of ``total`` are there, and what else there is to say of them."""
+        """Show that ``done`` of ``total`` are there, and what else there is to say of them.
+
+        Where fewer are there than before, or another number is wanted, other work has begun: its time is counted anew.
+        """
         what, note = one_line(what), one_line(note)
-        self._bar.update(self._task, completed=done, total=total, description=what, note=note)
         now = time.monotonic()
         if self._done_at_start is None:
             self._done_at_start = done
+        elif done < self._shown[0] or total != self._shown[1]:
+            self._done_at_start, self._start = done, now
+            self._bar.reset(self._task)
+        self._shown = done, total
+        self._bar.update(self._task, completed=done, total=total, description=what, note=note)
         due = now - self._last_line > _SECONDS_BETWEEN_LINES or done == total
         if not self._quiet and not _console.is_terminal and due:
             fresh, spent = done - self._done_at_start, now - self._start

@@ -83,6 +83,7 @@ def evaluate(
             workers=workers,
             device=device,
             on_progress=lambda done, of: bar.update(done, of, "evaluating"),
+            on_choosing=lambda done, of: bar.update(done, of, "choosing how many steps to execute"),
         )
     videos: list[Path] = []
     if films:

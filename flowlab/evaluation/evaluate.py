@@ -37,6 +37,7 @@ def evaluate(
     workers: int | None = None,
     device: str = "cpu",
     on_progress: Progress | None = None,
+    on_choosing: Progress | None = None,
 ) -> list[PolicyResult]:
     """Let trained policies act in simulation, on scenes that none of them was trained on.
 
@@ -55,6 +56,8 @@ def evaluate(
         workers: How many; by default one for each core that this process may use.
         device: Where plans are made, as PyTorch names it.
         on_progress: Told how many episodes are done, of how many.
+        on_choosing: Told the same of the other layouts, for one run after the other, while ``auto`` chooses; by default
+            ``on_progress`` is.
 
     Returns:
         A result for each run, with an evaluation for each of its checkpoints that were asked for, in order of steps.
@@ -85,7 +88,8 @@ def evaluate(
     if chooses:
         check_not_choosing(seeds)
         newest = {ref.run: ref for ref in sorted(refs, key=lambda r: r.step)}
-        choices = {run: choose_execution(ref, common_tasks(refs, tasks), run_trials) for run, ref in newest.items()}
+        choose = partial(run_trials, on_progress=on_choosing or progress)
+        choices = {run: choose_execution(ref, common_tasks(refs, tasks), choose) for run, ref in newest.items()}
         refs = [replace(ref, n_action_steps=choices[ref.run].best) for ref in refs]
     found = run_trials(refs, trials)
     by_run: dict[Path, list[CheckpointEvaluation]] = {}

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 from flowlab.engines.base import StartEngine, engine_by_name
 from flowlab.errors import DataError, FlowlabError
-from flowlab.files import told_when_unwritable
+from flowlab.files import remove_leftovers, temporary_path, told_when_unwritable
 from flowlab.grading import ground_truth
 from flowlab.grading.grade import RecordingGrade, TrackerGrade, grade_recording, summarize_rows
 from flowlab.grading.metrics import EstimatedTracks, TrackMetrics
@@ -69,7 +69,8 @@ def grade_on_engine(
         recordings: What to grade.
         trackers: Who labels.
         chunks: How a recording is cut for trackers that take it in parts.
-        out: Folder that all workers share, which exists; labels lie in a folder below it while the run lasts.
+        out: Folder that all workers share, which exists; labels lie in a folder below it while the run lasts, and
+            what dead runs left there is deleted.
         engine: Name or import path of what runs the workers.
         workers: Recordings at a time; None for what the engine takes by default.
         on_progress: Is told in words what is done.
@@ -82,7 +83,8 @@ def grade_on_engine(
         FlowlabError: A worker failed.
     """
     start: StartEngine[GradingUnit, GradingReceipt] = engine_by_name(engine, workers, [__name__])
-    with TemporaryDirectory(prefix=".tracks-", dir=out) as kept:
+    remove_leftovers(out)
+    with TemporaryDirectory(prefix=temporary_path(out / "tracks-").name, dir=out) as kept:
         places = [Path(kept).resolve() / str(k) for k in range(len(recordings))]
         units = [GradingUnit(r, tuple(trackers), chunks, p) for r, p in zip(recordings, places, strict=True)]
         rows: dict[Path, list[RecordingGrade]] = {}

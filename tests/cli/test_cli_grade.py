@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,7 @@ class Gloomy(Tracker):
     def open(self, clip):
         raise RuntimeError("not today")
 """
+SLEEPY = GLOOMY.replace("Gloomy", "Sleepy").replace('raise RuntimeError("not today")', "__import__('time').sleep(300)")
 SMALL = ("--size", "96x72", "--tracker", "lucas-kanade")
 
 
@@ -139,6 +142,52 @@ def test_who_does_the_work_makes_no_difference(
     assert "two: 12 frames; CPU time: lucas-kanade" in capsys.readouterr().err
     with pytest.raises(UsageError, match="no engine is called 'lokal'; did you mean local"):
         run(*asked, tmp_path / "other", "--engine", "lokal")
+
+
+def kill_a_run(recording: Path, out: Path, modules: Path) -> Path:
+    """Start a run, and kill it with its workers as they label; what it leaves."""
+    (modules / "sleepy.py").write_text(SLEEPY)
+    command = [sys.executable, "-m", "flowlab", "grade", recording, "--tracker", "sleepy:Sleepy", "--out", out]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(modules), *filter(None, sys.path)])}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, start_new_session=True)
+    try:
+        end = time.monotonic() + 60
+        while not (out.is_dir() and list(out.iterdir())):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < end, "waited in vain"
+            time.sleep(0.01)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+    (left,) = out.iterdir()
+    return left
+
+
+def test_what_a_killed_run_left_is_deleted_and_nothing_else(slides: Path, tmp_path: Path) -> None:
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    for folder in (outside, outside / "deeper"):
+        folder.mkdir()
+        (folder / "precious.txt").write_text("keep")
+    left = kill_a_run(slides / "one", out, tmp_path)
+    assert left.is_dir()
+    (left / "0-0.npz").symlink_to(outside)
+    machine, _, rest = left.name.partition("+")
+    dead, tracks = rest.split("+")
+    (out / f"{machine}+{dead}+tracks-link").symlink_to(outside / "deeper")
+    others = {
+        f"{machine}+{os.getpid()}+{tracks}": "of a run that goes on",
+        f"{machine}-b+{dead}+{tracks}": "of another machine's",
+        f"{machine}+{dead}{tracks}": "of nobody's",
+        ".tracks-mine": "of the user's",
+        "tracks": "of the user's",
+    }
+    for name, whose in others.items():
+        (out / name).mkdir()
+        (out / name / "0-0.npz").write_text(whose)
+    run(slides / "one", "--tracker", "lucas-kanade", "--out", out)
+    assert {p.name for p in out.iterdir()} == {"grade.json", "grade.png", *others}
+    assert {name: (out / name / "0-0.npz").read_text() for name in others} == others
+    assert [f.read_text() for f in outside.rglob("precious.txt")] == ["keep"] * 2
 
 
 def test_a_tracker_that_fails_ends_it_with_its_own_words(

@@ -8,6 +8,7 @@ import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from synthetic import call_cli, make_dataset, make_episode
@@ -49,6 +50,27 @@ def test_text_on_the_terminal_is_what_it_is(text: str, capsys: pytest.CaptureFix
     assert len(err.splitlines()) == 2
     if text == "[/red]":
         assert out.count(text) == 4
+
+
+@pytest.mark.parametrize(("total", "done"), [(60, 0), (100, 0), (100, 70)], ids=["as many", "more", "some known"])
+def test_other_work_has_a_time_of_its_own(
+    total: int, done: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left of an evaluation is not told from how long it took to choose."""
+    now = 0.0
+    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: now))
+    with console.ProgressBar() as bar:
+        bar.update(0, 60, "choosing")
+        now = 600.0
+        bar.update(60, 60, "choosing")
+        now = 605.0
+        bar.update(done, total, "evaluating")
+        now = 625.0
+        bar.update(done + 10, total, "evaluating")
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "choosing: 60 of 60 episodes, 600 s, 0 s left"
+    left = 2 * (total - done - 10)
+    assert second == f"evaluating: {done + 10} of {total} episodes, 20 s, {left} s left"
 
 
 def test_every_command_prints_through_the_console() -> None:

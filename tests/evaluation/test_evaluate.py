@@ -220,14 +220,18 @@ def test_how_many_steps_to_execute_is_chosen_on_other_layouts(
     """Of a policy that solves nothing all are equal, and the fewest plans win; nothing is tried twice."""
     monkeypatch.setattr(execution, "_LAYOUTS", 1)
     run, asked = copy(fdp, tmp_path), ("--task", TASK, "--seeds", 0, "--episodes", 1, "--execute", "auto")
+    code, out, err = call_cli(capsys, "eval", run, *map(str, asked), "--workers", "1")
+    assert code == 0, err
+    choosing, _, evaluating = err.partition("evaluating")
+    assert "choosing how many steps to execute: 3 of 3 episodes" in choosing
+    assert evaluating.startswith(": 1 of 1 episode")
+    before = files_below(run)
     (result,) = json.loads(evaluate(capsys, run, *asked, "--json"))
     assert result["execution"] == {"solved": {"2": 0, "4": 0, "8": 0}, "of": 1}
     assert [(e["n_action_steps"], len(e["outcomes"])) for e in result["evaluations"]] == [(8, 1)]
     for steps in (2, 4, 8):
         (line,) = lines_of(run, PLACE.replace("evaluation", "execution").replace("execute-8", f"execute-{steps}"))
         assert (line["seed"], line["scene_seed"]) == (3999, 4_000_000_000), "a layout that is not reported"
-    before = files_below(run)
-    out = evaluate(capsys, run, *asked)
     assert "fdp: executes 8 steps of every plan: of 1 other layouts solved are 0 by 8, 0 by 4, 0 by 2" in out
     assert files_below(run) == before
     code, err = refused(capsys, run, "--execute", "auto", "--seeds", "0,3999")
