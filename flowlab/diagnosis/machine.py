@@ -48,7 +48,8 @@ def find_gpu() -> Iterator[Diagnosis]:
         yield Diagnosis("gpu", "cuda", "no device; everything is computed on the CPU", "note", remedy)
     for k in range(torch.cuda.device_count() if torch.cuda.is_available() else 0):
         about = torch.cuda.get_device_properties(k)
-        bf16 = "bf16" if torch.cuda.is_bf16_supported() else "no bf16"
+        with torch.cuda.device(k):
+            bf16 = "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "no bf16"
         yield Diagnosis("gpu", f"cuda:{k}", f"{about.name}, {about.total_memory / _GB:.0f} GB, {bf16}")
 
 

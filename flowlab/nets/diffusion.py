@@ -74,8 +74,12 @@ class NoiseSampler:
 
     def normal(self, windows: int, *shape: int) -> Tensor:
         """Standard normal numbers for this process's part of so many windows."""
-        return torch.randn(windows, *shape, generator=self._generator)[self._part].to(self._device)
+        return self._kept(torch.randn(windows, *shape, generator=self._generator))
 
     def steps(self, below: int, windows: int, *shape: int) -> Tensor:
         """Diffusion steps, uniform from 0 to ``below - 1``."""
-        return torch.randint(below, (windows, *shape), generator=self._generator)[self._part].to(self._device)
+        return self._kept(torch.randint(below, (windows, *shape), generator=self._generator))
+
+    def _kept(self, drawn: Tensor) -> Tensor:
+        # Else the host would wait, at each draw, until a GPU has done all that was asked of it before.
+        return drawn[self._part].to(self._device, non_blocking=True)

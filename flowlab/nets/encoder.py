@@ -60,7 +60,10 @@ class PointNet(nn.Module):
     def _maximum(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Maximum over each cloud's points and which point has it: two of (B, C)."""
         at_once = max(1, _ROWS // points.shape[1]) if points.device.type == "cpu" else len(points)
-        with torch.no_grad():
+        kind = points.device.type
+        dtype, enabled = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
+        # Older PyTorch hands on weights that were cast here, without a gradient, to the pass that needs one.
+        with torch.no_grad(), torch.autocast(kind, dtype, enabled, cache_enabled=False):
             both = [_greatest(self.encode_points(chunk)) for chunk in torch.split(points, at_once)]
         return torch.cat([values for values, _ in both]), torch.cat([where for _, where in both])
 

@@ -32,12 +32,13 @@ class ProcessGroup:
         kind, _, number = device.partition(":")
         if kind not in ("cpu", "cuda") or not (number or "0").isdecimal():
             raise UsageError(f"--device {device}: there is no such device; use cpu, cuda or cuda:1")
-        if kind == "cuda" and int(number or "0") >= torch.cuda.device_count():
+        index = int(number or os.environ.get("LOCAL_RANK", "0"))
+        if kind == "cuda" and index >= torch.cuda.device_count():
             found = "no such GPU" if torch.cuda.is_available() else "no GPU"
             raise UsageError(f"--device {device}: PyTorch sees {found} here; use --device cpu")
-        if device == "cuda":
-            device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
-        self.device = torch.device(device)
+        self.device = torch.device("cuda", index) if kind == "cuda" else torch.device(device)
+        if kind == "cuda":
+            torch.cuda.set_device(self.device)  # what NCCL, and all that names no GPU, goes by
         self.precision = choose_precision(precision, self.device)
         torch.set_num_threads(threads)
         _reuse_freed_memory()

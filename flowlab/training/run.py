@@ -105,6 +105,27 @@ def prepare_run(
         DataError, UsageError: Settings, data or weights do not fit each other; then nothing is written but the decoded
             dataset.
     """
+    trainer, trained = make_trainer(
+        data, out, settings, compute, overfit=overfit, began_from=began_from, weights=weights
+    )
+    trainer.begin(trained)
+    return trainer
+
+
+def make_trainer(
+    data: Path | Sequence[Path],
+    out: Path,
+    settings: TrainSettings,
+    compute: ComputeSettings,
+    *,
+    overfit: int | None = None,
+    began_from: Path | None = None,
+    weights: Sequence[float] | None = None,
+) -> tuple[Trainer, TrainedPolicy]:
+    """The same without its folder, of which nothing is made, and what the folder would say of the policy.
+
+    Arguments and errors are those of :func:`prepare_run`.
+    """
     check_loggers(compute.logs)
     processes = ProcessGroup(compute.device, compute.threads, compute.precision)
     processes.part(settings.batch.windows)
@@ -143,8 +164,7 @@ def prepare_run(
         planned = planned.model_copy(update={"steps": processes.broadcast(steps)})
     check_drawn(source.parts, weighed, settings, planned.steps)
     trainer = Trainer(out, planned, policy, buffer, processes)
-    trainer.begin(TrainedPolicy.now(policy.spec, source, buffer, mixture))
-    return trainer
+    return trainer, TrainedPolicy.now(policy.spec, source, buffer, mixture)
 
 
 def _check_same(
@@ -255,7 +275,7 @@ def _fitting_steps(trial: Trainer, minutes: float) -> int:
         begin = time.perf_counter() if on_gpu else time.process_time()
         work()
         if on_gpu:
-            torch.cuda.synchronize()
+            torch.cuda.synchronize(trial.processes.device)
             return time.perf_counter() - begin
         return (time.process_time() - begin) / threads
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from flowlab.data.batch_builder import BatchBuilder
+from flowlab.data.batches import Batch
 from flowlab.data.mixture import make_sampler
 from flowlab.data.replay_buffer import ReplayBuffer
 from flowlab.data.window_sampler import index_windows
@@ -68,18 +69,24 @@ class Trainer:
         """Of metrics, so far."""
 
     def train_step(self) -> dict[str, float]:
-        """One step: the losses, averaged over all processes.
+        """One step: what :meth:`gather` gives and :meth:`learn` makes of it."""
+        return self.learn(*self.gather())
+
+    def gather(self) -> tuple[Batch, NoiseSampler]:
+        """This process's part of the step's windows, on its device, and where the step's noise comes from."""
+        seed = np.random.SeedSequence([self.settings.run.seed, self.step])
+        batch = self._builder.build(self._sampler.windows(self.step), np.random.default_rng(seed))
+        part = self.processes.part(len(batch.observed))
+        generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+        return batch.part(part).to(self.processes.device), NoiseSampler(generator, self.processes.device, part)
+
+    def learn(self, batch: Batch, noise: NoiseSampler) -> dict[str, float]:
+        """Change the weights by this process's part of a batch: the losses, averaged over all processes.
 
         Raises :class:`DivergedError`, before the weights change, where they are not finite.
         """
-        seed = np.random.SeedSequence([self.settings.run.seed, self.step])
-        batch = self._builder.build(self._sampler.windows(self.step), np.random.default_rng(seed))
-        windows = len(batch.observed)
-        part = self.processes.part(windows)
-        generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-        noise = NoiseSampler(generator, self.processes.device, part)
         with self.processes.autocast():
-            losses = self._network(batch.part(part).to(self.processes.device), noise, windows)
+            losses = self._network(batch, noise, len(batch.observed) * self.processes.count)
         values = {"loss": losses.total} | {f"{name}_loss": loss for name, loss in losses.parts.items()}
         numbers = self.processes.mean({k: v.detach() for k, v in values.items()})
         if not all(np.isfinite(v) for v in numbers.values()):
