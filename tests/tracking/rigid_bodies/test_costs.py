@@ -1,5 +1,6 @@
 """How badly a motion explains pictures: zero where it is right, and as bad as it says where it is not."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -31,6 +32,41 @@ def test_a_difference_of_color_costs_what_its_channels_say_and_at_most_1() -> No
     all_four = _costs.color_cost(FEATURE, 7.0, 5.0, at + np.float32([4, -7, 3, -3]))
     assert all_four == pytest.approx(4 * _costs.LCN + 7 * _costs.L + 3 * _costs.A + 3 * _costs.B)
     assert _costs.color_cost(FEATURE, 7.0, 5.0, at + 1000) == 1
+
+
+@pytest.mark.parametrize("light", [0.2, 0.35, 0.6])
+@pytest.mark.parametrize("color", [(200, 60, 40), (60, 160, 90), (70, 90, 210), (180, 180, 175)])
+def test_what_is_in_shadow_is_known_again_and_another_color_as_dark_is_not(color: tuple, light: float) -> None:
+    linear = np.array(color) / 255
+    dark = tuple(255 * (linear**2.2 * light) ** (1 / 2.2))  # as a camera shows what is lit by this share
+    alike = _cost_between(color, dark)
+    assert alike < _costs.SHADED + 0.2
+    other = _lab(dark)[[0, 2, 1]] + np.uint8([0, 30, 226])  # as dark, of another hue
+    assert _costs.color_cost(_picture(other), 3.0, 3.0, _features(color)) > alike + 0.2
+
+
+def test_another_light_never_costs_less_than_the_same_and_darkness_is_no_shadow() -> None:
+    assert _cost_between((200, 60, 40), (200, 60, 40)) < 1e-6
+    assert _cost_between((200, 60, 40), (195, 62, 40)) < _costs.SHADED
+    assert _cost_between((200, 200, 200), (20, 20, 20)) == 1
+
+
+def _cost_between(first: tuple, now: tuple) -> float:
+    """What a pixel that had one color (R, G, B) costs where a plain picture has another."""
+    return float(_costs.color_cost(_picture(_lab(now)), 3.0, 3.0, _features(first)))
+
+
+def _picture(lab: np.ndarray) -> np.ndarray:
+    return np.tile(np.append(128, lab).astype(np.uint8), (7, 7, 1))
+
+
+def _features(color: tuple) -> np.ndarray:
+    return np.append(128, _lab(color)).astype(np.float32)
+
+
+def _lab(color: tuple) -> np.ndarray:
+    """OpenCV's own L, a and b of a color (R, G, B)."""
+    return cv2.cvtColor(np.uint8([[color]]), cv2.COLOR_RGB2LAB)[0, 0]
 
 
 def test_the_nearest_reading_is_that_of_the_layer_meant() -> None:

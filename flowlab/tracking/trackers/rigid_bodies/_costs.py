@@ -11,6 +11,11 @@ SURFACE_TOLERANCE = 0.010
 """A depth this near a claimed surface [m, at up to 1 m; growing with the square of the distance] is that surface."""
 LCN, L, A, B = 0.25 * 3 / 255, 1 / 70, 1 / 30, 1 / 30
 """What one count of each feature channel costs; costs add up to at most 1."""
+SHADED, DARKEST = 0.25, 0.5
+"""What it costs to be in another light, and the least share to which that lets a color fall: the cube root of an eighth
+of the light."""
+BLACK, GRAY = 16 * 2.55, 128
+"""In another light L + 16, a and b of CIE 1976 change by one factor; here, L is in 255ths, and a and b begin at 128."""
 SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
 """Cost of a body's point where the camera looks through it, where something is in front, and where depth is missing."""
 
@@ -27,19 +32,25 @@ def tolerance(z) -> float:
 
 @numba.njit(cache=True)
 def color_cost(feature, u, v, f0) -> float:
-    """Difference, 0 to 1, between a feature picture (H, W, 4) at a sub-pixel position and four channel values."""
+    """Difference, 0 to 1, between a feature picture (H, W, 4) at a sub-pixel position and four channel values: of the
+    colors as they are or, for ``SHADED`` more, as they would be in another light."""
     height, width = feature.shape[:2]
     u = min(max(u, 0.0), width - 1.001)
     v = min(max(v, 0.0), height - 1.001)
     j, i = int(u), int(v)
-    a, b = u - j, v - i
-    w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+    x, y = u - j, v - i
+    w00, w01, w10, w11 = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
     p, q, r, s = feature[i, j], feature[i, j + 1], feature[i + 1, j], feature[i + 1, j + 1]
-    cost = abs(w00 * p[0] + w01 * q[0] + w10 * r[0] + w11 * s[0] - f0[0]) * LCN
-    cost += abs(w00 * p[1] + w01 * q[1] + w10 * r[1] + w11 * s[1] - f0[1]) * L
-    cost += abs(w00 * p[2] + w01 * q[2] + w10 * r[2] + w11 * s[2] - f0[2]) * A
-    cost += abs(w00 * p[3] + w01 * q[3] + w10 * r[3] + w11 * s[3] - f0[3]) * B
-    return min(cost, 1.0)
+    texture = abs(w00 * p[0] + w01 * q[0] + w10 * r[0] + w11 * s[0] - f0[0]) * LCN
+    light = w00 * p[1] + w01 * q[1] + w10 * r[1] + w11 * s[1]
+    a = w00 * p[2] + w01 * q[2] + w10 * r[2] + w11 * s[2]
+    b = w00 * p[3] + w01 * q[3] + w10 * r[3] + w11 * s[3]
+    color = abs(light - f0[1]) * L + abs(a - f0[2]) * A + abs(b - f0[3]) * B
+    share = (light + BLACK) / (f0[1] + BLACK)
+    if DARKEST < share < 1 / DARKEST:
+        off = abs(a - GRAY - share * (f0[2] - GRAY)) * A + abs(b - GRAY - share * (f0[3] - GRAY)) * B
+        color = min(color, SHADED + off)
+    return min(texture + color, 1.0)
 
 
 @numba.njit(cache=True)
