@@ -1,5 +1,7 @@
 """How badly a motion explains pictures: zero where it is right, and as bad as it says where it is not."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +11,12 @@ from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
+from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
+from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY
 
 rng = np.random.default_rng(0)
+_OFFSET = np.array([_costs.BLACK, -_costs.GRAY, -_costs.GRAY])
 FEATURE = rng.integers(0, 256, (20, 30, 4), np.uint8)
 
 
@@ -42,7 +48,21 @@ def test_what_is_in_shadow_is_known_again_and_another_color_as_dark_is_not(color
     alike = _cost_between(color, dark)
     assert alike < _costs.SHADED + 0.2
     other = _lab(dark)[[0, 2, 1]] + np.uint8([0, 30, 226])  # as dark, of another hue
-    assert _costs.color_cost(_picture(other), 3.0, 3.0, _features(color)) > alike + 0.2
+    assert _costs.color_cost(_picture(other), 3.0, 3.0, _features(color), _costs.SHADED) > alike + 0.2
+
+
+def test_a_point_that_goes_through_shadow_is_not_taken_for_hidden_and_poses_do_not_rest_in_shadow() -> None:
+    scene, t = two_plates(), 10
+    dark = scene.pictures.feature.astype(float)
+    dark[1:, ..., 1:] = 0.6 * (dark[1:, ..., 1:] + _OFFSET) - _OFFSET
+    pictures = replace(scene.pictures, feature=dark.clip(0, 255).astype(np.uint8))
+    uv, motion = scene.some_pixels(1, 200), scene.motion(1)
+    cost = motion_costs(pictures, segment_motion(scene.pictures), [motion], uv, scene.points(uv))
+    assert np.median(cost) < 0.6  # what it costs to be hidden
+    features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
+    pose = motion.R[None, None, t], motion.t[None, None, t]
+    seen = pictures.depth[t], pictures.feature[t], pictures.K, 1
+    assert _costs.energies(scene.points(uv)[None], features[None], *pose, *seen)[0] > LOST_ENERGY
 
 
 def test_another_light_never_costs_less_than_the_same_and_darkness_is_no_shadow() -> None:
@@ -53,7 +73,7 @@ def test_another_light_never_costs_less_than_the_same_and_darkness_is_no_shadow(
 
 def _cost_between(first: tuple, now: tuple) -> float:
     """What a pixel that had one color (R, G, B) costs where a plain picture has another."""
-    return float(_costs.color_cost(_picture(_lab(now)), 3.0, 3.0, _features(first)))
+    return float(_costs.color_cost(_picture(_lab(now)), 3.0, 3.0, _features(first), _costs.SHADED))
 
 
 def _picture(lab: np.ndarray) -> np.ndarray:

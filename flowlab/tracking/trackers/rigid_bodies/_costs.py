@@ -12,8 +12,9 @@ SURFACE_TOLERANCE = 0.010
 LCN, L, A, B = 0.25 * 3 / 255, 1 / 70, 1 / 30, 1 / 30
 """What one count of each feature channel costs; costs add up to at most 1."""
 SHADED, DARKEST = 0.5, 0.5
-"""What it costs to be in another light, so that to be seen in shadow costs less than to be hidden; and the least share to
-which that lets a color fall, the cube root of an eighth of the light."""
+"""What it costs a point to be in another light, so that to be seen in shadow costs less than to be hidden; and the least
+share to which that lets a color fall, the cube root of an eighth of the light. Poses do not have it: a body that is lost
+would be at rest in any shadow."""
 BLACK, GRAY = 16 * 2.55, 128
 """In another light L + 16, a and b of CIE 1976 change by one factor; here, L is in 255ths, and a and b begin at 128."""
 SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
@@ -31,9 +32,9 @@ def tolerance(z) -> float:
 
 
 @numba.njit(cache=True)
-def color_cost(feature, u, v, f0) -> float:
+def color_cost(feature, u, v, f0, shade=1.0) -> float:
     """Difference, 0 to 1, between a feature picture (H, W, 4) at a sub-pixel position and four channel values: of the
-    colors as they are or, for ``SHADED`` more, as they would be in another light."""
+    colors as they are or, for ``shade`` more, as they would be in another light."""
     height, width = feature.shape[:2]
     u = min(max(u, 0.0), width - 1.001)
     v = min(max(v, 0.0), height - 1.001)
@@ -49,7 +50,7 @@ def color_cost(feature, u, v, f0) -> float:
     share = (light + BLACK) / (f0[1] + BLACK)
     if DARKEST < share < 1 / DARKEST:
         off = abs(a - GRAY - share * (f0[2] - GRAY)) * A + abs(b - GRAY - share * (f0[3] - GRAY)) * B
-        color = min(color, SHADED + off)
+        color = min(color, shade + off)
     return min(texture + color, 1.0)
 
 
@@ -145,9 +146,9 @@ def motion_costs(points, point_features, frames, R, t, still_R, still_t, static,
                     continue
                 off, nearest, farthest = nearest_reading(depth[f], u, v, z)
                 if farthest == 0:
-                    cost[b, k] += 0.35 + 0.5 * color_cost(feature[f], u, v, point_features[k])
+                    cost[b, k] += 0.35 + 0.5 * color_cost(feature[f], u, v, point_features[k], SHADED)
                 elif off < tolerance(z):
-                    color = color_cost(feature[f], u, v, point_features[k])
+                    color = color_cost(feature[f], u, v, point_features[k], SHADED)
                     here = 0.7 * color + 0.35 * min(off / (0.6 * tolerance(z)), 1.0)
                     if away:
                         before = _background_cost(x, still_R[f], still_t[f], static, depth[0], feature, f, u, v, K)
@@ -189,7 +190,7 @@ def _background_cost(x, R, t, static, depth, feature, f, u, v, K) -> float:
         return 2.0
     if abs(depth[i, j] - z) > tolerance(z):
         return 2.0
-    return color_cost(feature[f], u, v, feature[0, i, j])
+    return color_cost(feature[f], u, v, feature[0, i, j], SHADED)
 
 
 @numba.njit(cache=True)
@@ -218,7 +219,7 @@ def residuals(depth, feature, point_features, uv, z) -> np.ndarray:
         for k in range(z.shape[1]):
             off, _, farthest = nearest_reading(depth[t], uv[t, k, 0], uv[t, k, 1], z[t, k])
             if farthest > 0:
-                color = color_cost(feature[t], uv[t, k, 0], uv[t, k, 1], point_features[k])
+                color = color_cost(feature[t], uv[t, k, 0], uv[t, k, 1], point_features[k], SHADED)
                 out[t, k] = 0.7 * color + 0.3 * min(off / tolerance(z[t, k]), 1.0)
     return out
 
