@@ -12,9 +12,9 @@ SURFACE_TOLERANCE = 0.010
 LCN, L, A, B = 0.25 * 3 / 255, 1 / 70, 1 / 30, 1 / 30
 """What one count of each feature channel costs; costs add up to at most 1."""
 SHADED, DARKEST = 0.5, 0.5
-"""What it costs a point to be in another light, so that to be seen in shadow costs less than to be hidden; and the least
-share to which that lets a color fall, the cube root of an eighth of the light. Poses do not have it, for a body that is
-lost would rest in any shadow; nor residuals, by which stated errors were fitted."""
+"""What it costs a point to be in another light, so that to be seen in shadow costs less than to be hidden; and the
+least share to which that lets a color fall, the cube root of an eighth of the light. Poses do not have it, for a body
+that is lost would rest in any shadow; nor residuals, by which stated errors were fitted."""
 BLACK, GRAY = 16 * 2.55, 128
 """In another light L + 16, a and b of CIE 1976 change by one factor; here, L is in 255ths, and a and b begin at 128."""
 SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
