@@ -329,6 +329,7 @@ def test_a_warm_up_has_something_to_see_whatever_the_observer_clears_away(sampli
         assert policy.warm_up() > 0
 
 
+@pytest.mark.slow  # 8 s
 def test_after_a_warm_up_nothing_is_left_to_compile(run: Path) -> None:
     """In a process of its own, where nobody else compiles."""
     script = f"""

@@ -49,6 +49,7 @@ def wait_until(condition: Callable[[], bool], seconds: float = 120) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow  # recordings do the same in tests/cli/test_cli_track_real.py
 def test_one_worker_gives_the_same_files_as_two(flowlab: Cli, small_dataset: Path, tmp_path: Path) -> None:
     extract(flowlab, tmp_path / "one", "--workers", 1)
     assert content(tmp_path / "one") == content(small_dataset)

@@ -148,7 +148,9 @@ VARIANTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "variant", [pytest.param(v, marks=pytest.mark.slow) if v == "fdp as in the paper" else v for v in VARIANTS]
+)  # 12 s
 def test_wherever_a_run_stops_nothing_is_lost(variant: str, rolls: Path, tmp_path: Path) -> None:
     """Of each kind of policy: at the first step, and off every line and checkpoint. Resumed twice in between."""
     policy, profile, changes = VARIANTS[variant]
