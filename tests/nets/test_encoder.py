@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from thoroughness import examples
 from torch import Tensor, nn
 
-from flowlab.nets import encoder
+from flowlab.nets import max_pooling
 from flowlab.nets.encoder import PointNet, linear_layers
 
 
@@ -66,34 +66,57 @@ def test_values_and_gradients_are_those_of_a_plain_pointnet(
     plain = Plain(net)
     points = torch.randn(clouds, size, 3, dtype=torch.float64)
     points = torch.cat([points, points[:, torch.arange(repeated) % size]], 1)  # clouds are filled up like this
+    mine_of, theirs_of = points.clone().requires_grad_(), points.clone().requires_grad_()
     wanted = torch.randn(clouds, 8, dtype=torch.float64)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(encoder, "_ROWS", at_once)
-        patch.setattr(encoder, "_BLOCK", block)
-        mine = net(points)
+        patch.setattr(max_pooling, "_AT_ONCE", at_once)
+        patch.setattr(max_pooling, "_BLOCK", block)
+        mine = net(mine_of)
         with torch.no_grad():
             torch.testing.assert_close(net(points), mine)
-    theirs = plain(points)
+    theirs = plain(theirs_of)
     torch.testing.assert_close(mine, theirs)
     (mine * wanted).sum().backward()
     (theirs * wanted).sum().backward()
     for copy, original in plain.twins:
         torch.testing.assert_close(original.weight.grad, copy.weight.grad)
         torch.testing.assert_close(original.bias.grad, copy.bias.grad)
+    torch.testing.assert_close(_of_places(mine_of), _of_places(theirs_of))
+
+
+def _of_places(points: Tensor) -> Tensor:
+    """The gradient of every place (B, N, 3): of points at one place any may have it."""
+    assert points.grad is not None
+    same = (points[:, :, None] == points[:, None]).all(-1)
+    return same.to(points.dtype) @ points.grad
+
+
+@pytest.mark.parametrize("frozen", ["layers.0", "norms.0", "layers.1", "norms"])
+def test_what_is_frozen_stays_and_the_rest_learns_as_before(frozen: str) -> None:
+    whole, part = make_net(), make_net()
+    part.get_submodule(frozen).requires_grad_(False)
+    points = torch.randn(3, 20, 3, dtype=torch.float64)
+    for net in (whole, part):
+        net(points).square().sum().backward()
+    for (name, a), b in zip(whole.named_parameters(), part.parameters(), strict=True):
+        if name.startswith(frozen):
+            assert b.grad is None
+        else:
+            torch.testing.assert_close(a.grad, b.grad)
 
 
 def test_only_points_that_matter_go_through_with_a_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
     net = make_net((8, 4))
     rows: list[tuple[int, bool]] = []
-    encode_points = net.encode_points
+    before_last = net._before_last
 
     def counted(xyz: Tensor) -> Tensor:
         rows.append((xyz[..., 0].numel(), torch.is_grad_enabled()))
-        return encode_points(xyz)
+        return before_last(xyz)
 
-    monkeypatch.setattr(net, "encode_points", counted)
-    monkeypatch.setattr(encoder, "_ROWS", 4)  # of which the number of points is made a multiple
-    net(torch.randn(3, 200, 3, dtype=torch.float64))
+    monkeypatch.setattr(net, "_before_last", counted)
+    monkeypatch.setattr(max_pooling, "_ROWS", 4)  # of which the number of points is made a multiple
+    net(torch.randn(3, 200, 3, dtype=torch.float64)).sum().backward()
     assert sum(n for n, with_gradient in rows if not with_gradient) == 600
     assert sum(n for n, with_gradient in rows if with_gradient) <= 3 * 4
     rows.clear()
@@ -150,3 +173,16 @@ def test_layers_have_relu_between_them_and_none_behind() -> None:
     first, _, last = net
     x = torch.randn(4, 3)
     torch.testing.assert_close(net(x), (x @ first.weight.T + first.bias).clamp(min=0) @ last.weight.T + last.bias)
+
+
+def test_a_network_whose_points_are_all_cut_off_learns_nothing_from_them() -> None:
+    net = make_net()
+    with torch.no_grad():
+        net.norms[-1].bias.fill_(-100)
+    net(torch.randn(3, 20, 3, dtype=torch.float64)).square().sum().backward()
+    for module in (*net.layers, *net.norms):
+        for p in module.parameters():
+            assert p.grad is not None
+            assert not p.grad.any(), "what the last ReLU takes away came back"
+    assert net.project.bias.grad is not None
+    assert net.project.bias.grad.any()
