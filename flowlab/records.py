@@ -184,11 +184,9 @@ class Tracks2D(Record):
     where none does."""
     residual: Float32[np.ndarray, "T M"] | None = None
     """How badly that model explains color and depth around the point, 0 to 1; -1 where none does."""
-    doubt: Float32[np.ndarray, "T M"] | None = None
-    """The probability that the position is off by more than 2 cm, as counted on scenes with truth; -1 where none is
-    told."""
-    slippage: Float32[np.ndarray, "T M"] | None = None
-    """How far [m] the point could have moved, with the surface around it, unseen; -1 where none is told."""
+    sigma: Float32[np.ndarray, "T M"] | None = None
+    """The error [m] that the tracker states itself where its model gives the position: two in three of such errors are
+    meant to be smaller; -1 where it states none."""
 
     def _check_values(self) -> None:
         if not np.isfinite(self.xy).all():

@@ -1,17 +1,21 @@
 """Whether the tracker says so where its motions cannot be trusted."""
 
 from dataclasses import replace
+from types import ModuleType
 
 import moving_planes
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from thoroughness import examples
 
 from flowlab.records import Clip, PositionSource, Tracks2D, Tracks3D
+from flowlab.tracking import uncertainty
 from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.labeling import label_clip
 from flowlab.tracking.lifting import LiftSettings
-from flowlab.tracking.trackers.rigid_bodies import RigidBodies
-from flowlab.tracking.trackers.rigid_bodies.doubt import EVIDENCE, WEIGHTS, probability_far
+from flowlab.tracking.trackers.rigid_bodies import RigidBodies, doubt
 
 FRAMES, SWAPPED = 16, 7
 WALL = np.stack(np.meshgrid(np.arange(12, 60, 8), np.arange(12, 110, 12)), -1).reshape(-1, 2).astype(np.float32)
@@ -49,14 +53,29 @@ def test_what_changed_without_a_motion_that_explains_it_states_a_large_error(swa
     modeled = after.quality.source[SWAPPED + 1 :, board] == PositionSource.MODEL
     assert modeled.any()
     assert (sigma[SWAPPED + 1 :, board][modeled] > 0.02).mean() > 0.9
-    assert tracks.doubt is not None
+    assert tracks.sigma is not None
+    assert (tracks.sigma[SWAPPED + 1 :, board] == sigma[SWAPPED + 1 :, board])[modeled].all()
 
 
-def test_worse_evidence_is_more_doubt() -> None:
-    rng = np.random.default_rng(0)
-    evidence = rng.uniform(0, 1, (5, 7, len(EVIDENCE)))
-    for k, weight in enumerate(WEIGHTS):
-        more = evidence.copy()
-        more[..., k] += 0.5
-        assert (np.sign(probability_far(more) - probability_far(evidence)) == np.sign(weight)).all(), EVIDENCE[k]
-    assert len(WEIGHTS) == len(EVIDENCE)
+@settings(max_examples=examples(60), deadline=None, derandomize=True)
+@given(data=st.data())
+@pytest.mark.parametrize("of", [doubt, uncertainty])
+def test_worse_evidence_never_states_less(of: ModuleType, data: st.DataObject) -> None:
+    column = data.draw(st.sampled_from([k for k, grows in enumerate(of.EVIDENCE.values()) if grows]))
+    numbers = st.floats(0, 1) | st.floats(0, 0.02) | st.floats(0, 100)
+    evidence = np.array(data.draw(st.lists(numbers, min_size=len(of.EVIDENCE), max_size=len(of.EVIDENCE))))[None]
+    worse = evidence.copy()
+    worse[0, column] += data.draw(st.floats(0, 2))
+    stated, more = (of.error_model().stated_error(e, np.ones(1))[0] for e in (evidence, worse))
+    assert more >= stated * (1 - 1e-6), list(of.EVIDENCE)[column]
+
+
+@pytest.mark.parametrize("of", [doubt, uncertainty])
+def test_it_grows_with_the_square_of_depth_beyond_what_was_seen(of: ModuleType) -> None:
+    near, far = of.error_model().stated_error(np.zeros((2, len(of.EVIDENCE))), np.array([10.0, 30]))
+    assert far / near == pytest.approx(9, rel=1e-4)
+
+
+def test_what_is_likely_far_off_states_decimeters() -> None:
+    evidence = np.array([[1.0 if grows else 0.5 for grows in doubt.EVIDENCE.values()]])
+    assert doubt.error_model().stated_error(evidence, np.ones(1))[0] > 0.2

@@ -1,25 +1,25 @@
-"""How likely a point is far from where its motion takes it, told by how well that explains what is around it."""
+"""How far a point may be from where its motion takes it, told by how well that explains what is around it."""
 
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
+from flowlab.tracking.error_model import ErrorModel
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
-EVIDENCE = (
-    "1", "surroundings", "body", "other motions around", "still", "spread", "apart", "apart, expected", "undecided",
-)  # fmt: skip
-"""What doubt is told from, see :func:`evidence`."""
-WEIGHTS = (-7.38, 4.65, 1.93, 3.50, 2.18, 0.15, 0.40, -0.02, 0.30)
-"""Log-odds per unit of evidence. Fitted by ``benchmarks/calibrate_sigma.py`` as of commit ee6b5f3."""
-FAR_M = 0.02
-"""An error beyond this is far."""
+EVIDENCE = {
+    "surroundings": 1, "worst surroundings": 1, "misfit": 1, "worst misfit": 1, "other motions around": 1, "spread": 1,
+    "apart": 1, "slippage": 1, "fastest": 1, "moved": 0, "camera moved": 0, "hidden for": 0, "still": 0,
+    "cells": 0, "share of cells": 0,
+}  # fmt: skip
+"""What doubt is told from, see :func:`evidence`, and whether more of it (1) never states less."""
 _CELLS, _NEAR = 3000, 12
 """Cells at least that speak for the whole picture, and how many of them are a point's surroundings."""
 _FRAMES_AT_ONCE = 128
@@ -27,23 +27,25 @@ _UNSEEN_COST = 0.6
 """What a cell counts that is not seen where its motion takes it."""
 
 
+@cache
+def error_model() -> ErrorModel:
+    """What tells errors from that, as ``benchmarks/calibrate_sigma.py`` fitted it."""
+    return ErrorModel.read(files(__package__) / "error_model.npz")
+
+
 @dataclass(frozen=True, slots=True)
-class SecondOpinion:
-    """Where a tracker that knows nothing of bodies puts the same points."""
+class _Cells:
+    """Cells that speak for the whole picture."""
 
-    xyz_cam: Float64[np.ndarray, "T M 3"]
-    error_m: Float32[np.ndarray, "T M"]
-    """What it states of its own error [m]."""
-
-
-def probability_far(evidence: Float64[np.ndarray, "T M E"]) -> Float32[np.ndarray, "T M"]:
-    """The probability that a position is off by more than ``FAR_M``, by a logistic regression on scenes with truth."""
-    return (1 / (1 + np.exp(-evidence @ np.array(WEIGHTS)))).astype(np.float32)
+    xyz: Float64[np.ndarray, "n 3"]
+    motion: Int64[np.ndarray, "n"]
+    cost: Float32[np.ndarray, "T n"]
+    """How badly every frame fits them."""
 
 
 def evidence(
     fit: RigidBodyFit, carried: PropagatedTracks, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarray, "M"],
-    other: SecondOpinion,
+    seen: Bool[np.ndarray, "T M"], other_xyz_cam: Float[np.ndarray, "T M 3"], slippage: Float[np.ndarray, "M"],
 ) -> Float64[np.ndarray, "T M E"]:  # fmt: skip
     """What speaks against positions.
 
@@ -52,36 +54,77 @@ def evidence(
         carried: The points, as the fit carries them.
         uv: Their pixels in the first of the pictures of the fit.
         z: Their depths there [m].
-        other: Where another tracker puts them.
+        seen: Whether the sensor sees them.
+        other_xyz_cam: Where a tracker that knows nothing of bodies puts them [m].
+        slippage: How far they could move unseen [m].
 
     Returns:
-        For every position, how badly frames fit around it, and in all that has its motion, 0 to 1; the share of its
-        surroundings that has another motion; whether it is said to stand still; as logs of mm, how far motions that
-        explain it almost as well would put it, how far the other tracker does, and how far that errs itself; and
-        whether it was not seen to stay, or is near what moved.
+        For every position, how badly the frame fits around it, and how badly one has so far, 0 to 1; the same of
+        the point itself; the share of its surroundings that has another motion; how far [m] motions that explain it
+        almost as well, and how far the other tracker, would put it; its slippage; the longest step of its body so far
+        and how far it has moved [m], before what stands still; how far that has moved itself where it was found in the
+        pictures; for how many frames it has been hidden; whether it is said to stand still; and how
+        many cells are its body's, also as a share of all.
     """
+    still, xyz_cam = fit.motions[0], fit.pictures.unproject(uv.astype(float), z.astype(float))
+    moved = np.linalg.norm(_undo(still, carried.xyz_cam) - xyz_cam, axis=-1)
+    camera_moved = np.linalg.norm(still.apply(xyz_cam) - xyz_cam, axis=-1) * fit.pictures.still_is_fitted
+    cells = _cells(fit)
+    around = cKDTree(cells.xyz).query(xyz_cam, k=min(_NEAR, len(cells.xyz)))[1].reshape(len(uv), -1)
+    surroundings = cells.cost[:, around].mean(2)
+    count = np.bincount(fit.assignment.best_motion[fit.assignment.best_motion >= 0], minlength=len(fit.motions))
+    columns = (
+        surroundings,
+        np.maximum.accumulate(surroundings),
+        carried.residual,
+        np.maximum.accumulate(np.where(carried.visible, carried.residual, 0)),
+        (cells.motion[around] != carried.motion[:, None]).mean(1),
+        carried.spread,
+        np.linalg.norm(carried.xyz_cam - other_xyz_cam, axis=-1),
+        slippage,
+        _fastest(fit)[:, carried.motion],
+        moved,
+        camera_moved,
+        _frames_hidden(seen),
+        carried.motion == 0,
+        count[carried.motion],
+        count[carried.motion] / max(count.sum(), 1),
+    )
+    return np.stack([np.broadcast_to(c, seen.shape) for c in columns], -1).astype(np.float64)
+
+
+def _cells(fit: RigidBodyFit) -> _Cells:
     pictures, grid, owner = fit.pictures, fit.grid, fit.assignment.best_motion
     at = np.argwhere(owner >= 0)
-    at = at[:: max(1, len(at) // _CELLS)]
-    cells = tuple(at.T)
+    cells = tuple(at[:: max(1, len(at) // _CELLS)].T)
     pixels = np.stack([grid.u[cells], grid.v[cells]], 1).astype(np.float32)
     xyz = pictures.unproject(pixels.astype(float), grid.depth[cells].astype(float))
     cost, seen = _fit_of_cells(fit, owner[cells], pixels, xyz)
-    around = cKDTree(xyz).query(pictures.unproject(uv.astype(float), z.astype(float)), k=min(_NEAR, len(xyz)))[1]
-    around = around.reshape(len(uv), -1)
-    still = carried.motion == 0
-    columns = (
-        np.ones(seen.shape[:1] + still.shape),
-        np.where(seen, cost, _UNSEEN_COST)[:, around].mean(2),
-        _fit_of_motions(cost, seen, owner[cells], len(fit.motions))[:, carried.motion],
-        (owner[cells][around] != carried.motion[:, None]).mean(1),
-        still,
-        np.log1p(1000 * carried.spread),
-        np.log1p(1000 * np.linalg.norm(carried.xyz_cam - other.xyz_cam, axis=-1)),
-        np.log1p(1000 * other.error_m),
-        grid.undecided[tuple(np.minimum(np.rint(uv[:, ::-1] / STEP).astype(int), np.array(owner.shape) - 1).T)],
-    )
-    return np.stack([np.broadcast_to(c, columns[0].shape) for c in columns], -1).astype(np.float64)
+    return _Cells(xyz, owner[cells], np.where(seen, cost, _UNSEEN_COST))
+
+
+def _undo(motion: RigidMotion, xyz_cam: Float[np.ndarray, "T n 3"]) -> Float64[np.ndarray, "T n 3"]:
+    """Where points of every frame were at the first, had they moved so."""
+    return (xyz_cam - motion.t[:, None]) @ motion.R
+
+
+def _fastest(fit: RigidBodyFit) -> Float64[np.ndarray, "T B"]:
+    """The longest step [m] that the middle of each body has made so far, before what stands still."""
+    owner, grid, steps = fit.assignment.best_motion, fit.grid, np.zeros((len(fit.pictures), len(fit.motions)))
+    for k, motion in enumerate(fit.motions):
+        cells = owner == k
+        if cells.any():
+            pixels = np.stack([grid.u[cells], grid.v[cells]], 1).astype(float)
+            middle = fit.pictures.unproject(pixels, grid.depth[cells].astype(float)).mean(0, keepdims=True)
+            path = _undo(fit.motions[0], motion.apply(middle))[:, 0]
+            steps[1:, k] = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return np.maximum.accumulate(steps)
+
+
+def _frames_hidden(seen: Bool[np.ndarray, "T M"]) -> Float64[np.ndarray, "T M"]:
+    """For how many frames each point has been out of sight."""
+    frame = np.arange(len(seen), dtype=float)[:, None]
+    return frame - np.maximum.accumulate(np.where(seen, frame, -1))
 
 
 def _fit_of_cells(
@@ -100,12 +143,3 @@ def _fit_of_cells(
         cost[now] = _costs.residuals(pictures.depth[now], pictures.feature[now], features, uv, z)
         seen[now] = _surfaces.is_seen(pictures.depth[now], uv, z) & (cost[now] >= 0)
     return cost, seen
-
-
-def _fit_of_motions(cost: np.ndarray, seen: np.ndarray, motion: np.ndarray, motions: int) -> np.ndarray:
-    """How badly every frame fits the cells of every motion that are seen in it (T, B); 1 where none is."""
-    total, count = np.zeros((2, len(cost), motions))
-    for k in range(motions):
-        mine = seen[:, motion == k]
-        total[:, k], count[:, k] = (cost[:, motion == k] * mine).sum(1), mine.sum(1)
-    return np.where(count > 0, total / np.maximum(count, 1), 1.0)

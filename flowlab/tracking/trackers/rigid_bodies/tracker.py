@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from pydantic import Field
 
 from flowlab.records import Clip, Tracks2D
@@ -18,7 +18,6 @@ from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extrac
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
 from flowlab.tracking.trackers.rigid_bodies.slippage import slippage
-from flowlab.tracking.uncertainty import stated_error
 
 _MIN_FRAMES = 3
 """A shorter clip shows no motion to fit."""
@@ -85,10 +84,10 @@ class FittedPoints:
     points: Int64[np.ndarray, "M"]
     """Which of those asked for."""
     carried: PropagatedTracks
+    seen: Bool[np.ndarray, "T M"]
+    """Whether the sensor sees them."""
     evidence: Float64[np.ndarray, "T M E"]
     """Against their positions, see :func:`~flowlab.tracking.trackers.rigid_bodies.doubt.evidence`."""
-    slippage: Float64[np.ndarray, "M"]
-    """How far [m] each could move unseen."""
 
 
 def fit_points(
@@ -111,12 +110,12 @@ def fit_points(
     if not fit.grid.valid.any():
         return None
     carried = propagate(fit, uv, z[deep])
-    lifted = lift(clip, followed, LiftSettings())
-    other = doubt.SecondOpinion(
-        clip.to_camera(lifted.xyz_world[:, deep].astype(np.float64)), stated_error(clip, followed, lifted)[:, deep]
-    )
+    xyz_cam = carried.xyz_cam
+    seen = is_seen(clip.depth, pictures.to_clip_pixels(pictures.project(xyz_cam)), xyz_cam[..., 2])
+    followed_cam = clip.to_camera(lift(clip, followed, LiftSettings()).xyz_world[:, deep].astype(np.float64))
     unseen = slippage(fit, pictures.unproject(uv.astype(np.float64), z[deep].astype(np.float64)))
-    return FittedPoints(pictures, deep, carried, doubt.evidence(fit, carried, uv, z[deep], other), unseen)
+    against = doubt.evidence(fit, carried, uv, z[deep], seen, followed_cam, unseen)
+    return FittedPoints(pictures, deep, carried, seen, against)
 
 
 def combined(clip: Clip, followed: Tracks2D, fitted: FittedPoints | None, unexplained: float) -> Tracks2D:
@@ -145,7 +144,7 @@ def _blank(frames: int, xy: np.ndarray) -> Tracks2D:
     held = np.broadcast_to(xy.astype(np.float32), (*shape, 2)).copy()
     zero, minus = np.zeros(shape, np.float32), np.full(shape, -1, np.float32)
     nowhere = np.zeros((*shape, 3), np.float32)
-    unknown = [minus.copy() for _ in range(4)]
+    unknown = [minus.copy() for _ in range(3)]
     return Tracks2D(held, np.zeros(shape, bool), zero, minus, unknown[0], nowhere, *unknown[1:])
 
 
@@ -171,11 +170,10 @@ def _modeled(clip: Clip, fitted: FittedPoints, of: np.ndarray) -> Tracks2D:
     apart = np.maximum(carried.spread[:, of], carried.slip[:, of])
     return Tracks2D(
         xy.astype(np.float32),
-        is_seen(clip.depth, xy, z),
+        fitted.seen[:, of],
         (1 - cost).clip(0, 1).astype(np.float32),
         disagreement=(apart * focal / np.maximum(z, 0.05)).astype(np.float32),
         xyz_cam=np.where(ahead[..., None], xyz, 0).astype(np.float32),
         residual=carried.residual[:, of],
-        doubt=doubt.probability_far(fitted.evidence[:, of]),
-        slippage=np.broadcast_to(fitted.slippage[of], z.shape).astype(np.float32),
+        sigma=doubt.error_model().stated_error(fitted.evidence[:, of], z).astype(np.float32),
     )
