@@ -11,7 +11,8 @@ from flowlab.tracking.boosted_trees import BoostedTrees
 
 FAR_M = 0.02
 """An error beyond this is far."""
-_NEAREST_M = 0.05
+_NEAREST_M = 0.2
+"""What is nearer, or behind the camera, is no surer than this."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,3 +66,10 @@ def test_an_error_model_states_what_either_forest_asks_for_also_from_its_file(tm
     for each in (model, ErrorModel.read(tmp_path / "model.npz")):
         np.testing.assert_allclose(each.stated_error(evidence, np.ones(4)), [0.001, 0.01, 0.3, 0.3], rtol=1e-5)
         np.testing.assert_allclose(each.stated_error(evidence, np.full(4, 3.0)), [0.009, 0.09, 0.3, 0.3], rtol=1e-5)
+
+
+def test_what_is_behind_the_camera_is_no_surer_than_what_is_near() -> None:
+    leaf = as_arrays([np.log(0.002)])
+    model = ErrorModel(as_arrays([-6.0]), leaf, np.array([[-5.0, 0.0], [0.0, 0.3]]))
+    behind, at_it, near = model.stated_error(np.zeros((3, 1)), np.array([-1.0, 0.0, 0.2]))
+    assert behind == at_it == near > 0
