@@ -89,7 +89,7 @@ def main() -> None:
         stated = []
         for k in range(_FOLDS):
             model = _fit([s for i, part in enumerate(parts) if i % _FOLDS != k for s in part], of.EVIDENCE)
-            stated += [(s, model.stated_error(s.evidence, s.z)) for part in parts[k::_FOLDS] for s in part]
+            stated += [(s, _stated(model, s)) for part in parts[k::_FOLDS] for s in part]
         print("modeled" if modeled else "measured or filled")
         for group in _by_group([s for s, _ in stated]):
             _report(group, [(s, sigma) for s, sigma in stated if s.group == group])
@@ -195,6 +195,12 @@ def _as_arrays(trees: Sequence[dict[str, Any]]) -> BoostedTrees:
         np.array(root, np.int32), np.array(column, np.int16), np.array(threshold), np.array([left, right], np.int32).T,
         np.array(value, np.float32),
     )  # fmt: skip
+
+
+def _stated(model: ErrorModel, sample: Sample) -> np.ndarray:
+    if sample.modeled:
+        return doubt.stated_error(sample.evidence, sample.z, model)
+    return model.stated_error(sample.evidence, sample.z)
 
 
 def _report(group: str, stated: Sequence[tuple[Sample, np.ndarray]]) -> None:

@@ -79,3 +79,9 @@ def test_it_grows_with_the_square_of_depth_beyond_what_was_seen(of: ModuleType) 
 def test_what_is_likely_far_off_states_decimeters() -> None:
     evidence = np.array([[1.0 if grows else 0.5 for grows in doubt.EVIDENCE.values()]])
     assert doubt.error_model().stated_error(evidence, np.ones(1))[0] > 0.2
+
+
+def test_what_could_have_slid_far_unseen_states_half_of_that() -> None:
+    evidence = np.zeros((1, len(doubt.EVIDENCE)))
+    evidence[0, list(doubt.EVIDENCE).index("slippage")] = 0.9
+    assert doubt.stated_error(evidence, np.ones(1))[0] >= 0.45

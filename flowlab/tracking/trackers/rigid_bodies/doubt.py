@@ -20,11 +20,28 @@ EVIDENCE = {
     "cells": 0, "share of cells": 0,
 }  # fmt: skip
 """What doubt is told from, see :func:`evidence`, and whether more of it (1) never states less."""
+_OF_SLIPPAGE = 0.5
+"""So much of how far it could have moved unseen is stated at least: trees have seen few things that slide far."""
 _CELLS, _NEAR = 3000, 12
 """Cells at least that speak for the whole picture, and how many of them are a point's surroundings."""
 _FRAMES_AT_ONCE = 128
 _UNSEEN_COST = 0.6
 """What a cell counts that is not seen where its motion takes it."""
+
+
+def stated_error(
+    evidence: Float64[np.ndarray, "*n E"], z: Float64[np.ndarray, "*n"], model: ErrorModel | None = None
+) -> Float64[np.ndarray, "*n"]:
+    """The error [m] that two in three of such positions stay below; more, where it is likely that they are far off, and
+    where they could have moved far unseen.
+
+    Args:
+        evidence: Against them.
+        z: Their depths [m].
+        model: What tells errors; that of :func:`error_model` by default.
+    """
+    slippage = evidence[..., list(EVIDENCE).index("slippage")]
+    return np.maximum((model or error_model()).stated_error(evidence, z), _OF_SLIPPAGE * slippage)
 
 
 @cache

@@ -175,5 +175,5 @@ def _modeled(clip: Clip, fitted: FittedPoints, of: np.ndarray) -> Tracks2D:
         disagreement=(apart * focal / np.maximum(z, 0.05)).astype(np.float32),
         xyz_cam=np.where(ahead[..., None], xyz, 0).astype(np.float32),
         residual=carried.residual[:, of],
-        sigma=doubt.error_model().stated_error(fitted.evidence[:, of], z).astype(np.float32),
+        sigma=doubt.stated_error(fitted.evidence[:, of], z).astype(np.float32),
     )
