@@ -47,10 +47,10 @@ QUANTILE = 0.60
 """Of the error; more is stated where it is likely to be far off."""
 FAR_OFF = {
     True: ((-4.5, -4.0, -2.5, -0.5), (0.0, 0.03, 0.10, 0.40)),
-    False: ((-2.75, -1.75, -0.5, 0.5), (0.0, 0.025, 0.10, 0.25)),
+    False: ((-2.5, -1.5, 0.0, 1.0, 2.0), (0.0, 0.02, 0.08, 0.20, 0.30)),
 }
 """Of what is modeled and what is not: see :attr:`~flowlab.tracking.error_model.ErrorModel.far_off`. Half of all that
-Lucas-Kanade says is likely far off: were it to state as much, nothing that it labels would be kept."""
+Lucas-Kanade says is likely far off: were it to state as much, good labels would be rejected."""
 _SAMPLE = 1500
 """Positions of each film."""
 _TREES = {
