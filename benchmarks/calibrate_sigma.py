@@ -59,6 +59,7 @@ _TREES = {
 }  # fmt: skip
 _ROUNDS = 120
 _LEAST_M = 3e-4
+"""Less of an error [m] tells nothing: a log would make much of it."""
 
 
 @dataclass(frozen=True)
