@@ -4,10 +4,11 @@
 
 Simulates tasks that no benchmark grades and films procedural scenes of the families that are not held out, and labels
 them with both trackers that need no weights. Two error models (``flowlab.tracking.error_model``) are fitted and written
-into their packages: of positions that ``rigid-bodies`` carries, and of those that are measured or filled. Each is two
-forests of boosted trees: a quantile of the error, and the log-odds that it is above 2 cm. Tasks and families of scenes
-weigh the same, and so do the films of each. What is printed is of films that the trees were not fitted to: a fifth of
-all is left out, five times. Needs OpenGL for color, and LightGBM (``pip install --group benchmark``).
+into their packages: of positions that ``rigid-bodies`` carries, and of those that are measured or filled. Each is some
+forests of boosted trees: a quantile of the error, and the log-odds that it is above 2 cm, or 15. Tasks and families of
+scenes weigh the same, and so do the films of each. What is printed is of films that the trees were not fitted to: a
+fifth of all is left out, five times; then each family, and the tasks. Needs OpenGL for color, and LightGBM (``pip
+install --group benchmark``).
 """
 
 import argparse
@@ -23,7 +24,7 @@ from flowlab.errors import DataError
 from flowlab.grading import ground_truth
 from flowlab.grading.grade import read_clip
 from flowlab.grading.scenes.families import making_films
-from flowlab.grading.scenes.film import make_film
+from flowlab.grading.scenes.film import CameraMotion, FilmSettings, make_film
 from flowlab.grading.simulate import SimulatedRecording, simulate_recording
 from flowlab.records import PositionSource
 from flowlab.sim.sensor import CLEAN, KINECT
@@ -31,7 +32,7 @@ from flowlab.tracking import uncertainty
 from flowlab.tracking.base import make_tracker
 from flowlab.tracking.boosted_trees import BoostedTrees
 from flowlab.tracking.chunking import ChunkSettings, follow
-from flowlab.tracking.error_model import FAR_M, ErrorModel, log_scale
+from flowlab.tracking.error_model import FAR_M, Doubt, ErrorModel, log_scale
 from flowlab.tracking.lifting import LiftSettings, lift
 from flowlab.tracking.trackers.rigid_bodies import doubt
 from flowlab.tracking.trackers.rigid_bodies.tracker import RigidBodies, combined, fit_points
@@ -43,14 +44,20 @@ TASKS = (
 """None of the eight that accuracy is reported on."""
 SEEDS, _FOLDS = range(30), 5
 """Of each family of scenes, and by how many fits, each without a part of the films, they are checked."""
+CARRIED: dict[CameraMotion, range] = {"traveling": range(12), "traveling, poses known": range(12, 16)}
+"""Seeds of more films, past whose scenes the camera is carried."""
 QUANTILE = 0.60
 """Of the error; more is stated where it is likely to be far off."""
-FAR_OFF = {
-    True: ((-4.5, -4.0, -2.5, -0.5), (0.0, 0.03, 0.10, 0.40)),
-    False: ((-2.5, -1.5, 0.0, 1.0, 2.0), (0.0, 0.02, 0.08, 0.20, 0.30)),
+DOUBTS = {
+    True: {
+        FAR_M: ((-4.5, -4.0, -2.5, -0.5), (0.0, 0.03, 0.045, 0.07)),
+        0.15: ((-7.0, -6.0, -4.5, -2.5), (0.0, 0.03, 0.10, 0.40)),
+    },
+    False: {FAR_M: ((-2.5, -1.5, 0.0, 1.0, 2.0), (0.0, 0.02, 0.08, 0.20, 0.30))},
 }
-"""Of what is modeled and what is not: see :attr:`~flowlab.tracking.error_model.ErrorModel.far_off`. Half of all that
-Lucas-Kanade says is likely far off: were it to state as much, good labels would be rejected."""
+"""Of what is modeled and what is not, for errors beyond some lengths [m]: see
+:attr:`~flowlab.tracking.error_model.Doubt.stated`. Half of all that Lucas-Kanade says is likely far off: were it to
+state as much, good labels would be rejected."""
 _SAMPLE = 1500
 """Positions of each film."""
 _TREES = {
@@ -66,8 +73,10 @@ _LEAST_M = 3e-4
 class Sample:
     """Positions of one recording by one tracker, all modeled or none."""
 
-    group: str
-    """The family of scenes, or ``tasks``."""
+    family: str
+    """Of scenes, or ``tasks``."""
+    carried: bool
+    """Whether the camera is."""
     modeled: bool
     evidence: np.ndarray
     """(n, E): of ``rigid-bodies`` where it models them, else of :mod:`flowlab.tracking.uncertainty`."""
@@ -77,6 +86,11 @@ class Sample:
     seen: np.ndarray
     """Whether the point is in sight, or said to be."""
 
+    @property
+    def group(self) -> str:
+        """What it is reported with."""
+        return f"{self.family}, carried" if self.carried else self.family
+
 
 def main() -> None:
     """Make the recordings, print how good the models are, and write them."""
@@ -85,15 +99,17 @@ def main() -> None:
     folder: Path = parser.parse_args().recordings
     recordings = [_of_task(folder, task, k) for k, task in enumerate(TASKS)]
     recordings += [_of_film(folder, family, seed) for family, seed in making_films(SEEDS)]
+    recordings += [
+        _of_film(folder, family, seed, camera)
+        for camera, seeds in CARRIED.items()
+        for family, seed in making_films(seeds)
+    ]
     for modeled, of in ((True, doubt), (False, uncertainty)):
         parts = [[s for s in samples if s.modeled is modeled] for samples in recordings]
-        stated = []
-        for k in range(_FOLDS):
-            model = _fit([s for i, part in enumerate(parts) if i % _FOLDS != k for s in part], of.EVIDENCE)
-            stated += [(s, _stated(model, s)) for part in parts[k::_FOLDS] for s in part]
         print("modeled" if modeled else "measured or filled")
-        for group in _by_group([s for s, _ in stated]):
-            _report(group, [(s, sigma) for s, sigma in stated if s.group == group])
+        parts = [part for part in parts if part]
+        _check(parts, [k % _FOLDS for k in range(len(parts))], of.EVIDENCE, "a fifth left out")
+        _check(parts, [part[0].family for part in parts], of.EVIDENCE, "all of the family left out")
         with (Path(of.__file__).parent / "error_model.npz").open("wb") as stream:
             _fit([s for part in parts for s in part], of.EVIDENCE).write(stream)
 
@@ -103,17 +119,17 @@ def _of_task(folder: Path, task: str, k: int) -> list[Sample]:
     for sensor in (KINECT, CLEAN) if k % 3 == 0 else (KINECT,):
         recording = folder / f"{task}-{'clean' if sensor is CLEAN else 'kinect'}"
         simulate_recording(recording, task, 100 + k, SimulatedRecording(sensor=sensor))
-        found += _collect(recording, "tasks")
+        found += _collect(recording, "tasks", False)
     return found
 
 
-def _of_film(folder: Path, family: str, seed: int) -> list[Sample]:
-    recording = folder / f"{family}-{seed}"
-    make_film(recording, family, seed)
-    return _collect(recording, family)
+def _of_film(folder: Path, family: str, seed: int, camera: CameraMotion | None = None) -> list[Sample]:
+    recording = folder / f"{family}{'' if camera is None else '-carried'}-{seed}"
+    make_film(recording, family, seed, FilmSettings(camera=camera))
+    return _collect(recording, family, camera is not None)
 
 
-def _collect(recording: Path, group: str) -> list[Sample]:
+def _collect(recording: Path, family: str, carried: bool) -> list[Sample]:
     """The positions of a recording by both trackers, but for the first frame's."""
     print(recording.name, flush=True)
     try:
@@ -137,38 +153,53 @@ def _collect(recording: Path, group: str) -> list[Sample]:
             mine = (by_model == modeled) & (np.arange(len(clip)) > 0)[:, None]
             if mine.any():
                 z = xyz_cam[mine, 2]
-                samples.append(Sample(group, modeled, values[mine], z, error_m[mine], seen[mine]))
+                samples.append(Sample(family, carried, modeled, values[mine], z, error_m[mine], seen[mine]))
     return samples
 
 
-def _by_group(samples: Sequence[Sample]) -> dict[str, list[Sample]]:
-    return {name: [s for s in samples if s.group == name] for name in dict.fromkeys(s.group for s in samples)}
+def _by_family(samples: Sequence[Sample]) -> list[list[Sample]]:
+    return [[s for s in samples if s.family == name] for name in dict.fromkeys(s.family for s in samples)]
+
+
+def _check(parts: list[list[Sample]], fold: Sequence[object], grows: Mapping[str, int], how: str) -> None:
+    """Print how good models are on recordings that they are not fitted to: of one fold after the other."""
+    stated = []
+    for out in dict.fromkeys(fold):
+        model = _fit([s for part, k in zip(parts, fold, strict=True) if k != out for s in part], grows)
+        left = [s for part, k in zip(parts, fold, strict=True) if k == out for s in part]
+        stated += [(s, _stated(model, s)) for s in left]
+    print(how)
+    for group in dict.fromkeys(s.group for s, _ in stated):
+        _report(group, [(s, sigma) for s, sigma in stated if s.group == group])
 
 
 def _fit(samples: Sequence[Sample], grows: Mapping[str, int]) -> ErrorModel:
-    far_off = np.array(FAR_OFF[samples[0].modeled])
-    return ErrorModel(_fit_trees(samples, grows, True), _fit_trees(samples, grows, False), far_off)
+    doubts = DOUBTS[samples[0].modeled].items()
+    return ErrorModel(
+        _fit_trees(samples, grows),
+        tuple(Doubt(_fit_trees(samples, grows, far), np.array(least)) for far, least in doubts),
+    )
 
 
-def _fit_trees(samples: Sequence[Sample], grows: Mapping[str, int], far_off: bool) -> BoostedTrees:
-    """Trees of the log-odds of an error above 2 cm of positions in sight or said to be, or of a quantile of the log of
-    the error of all: of its mean where it is below 2 cm, and so much more."""
+def _fit_trees(samples: Sequence[Sample], grows: Mapping[str, int], beyond_m: float | None = None) -> BoostedTrees:
+    """Trees of the log-odds of an error beyond a length of positions in sight or said to be, or of a quantile of the
+    log of the error of all: of its mean where it is below 2 cm, and so much more."""
     rng, rows, targets, weights = np.random.default_rng(0), [], [], []
-    for mine in _by_group(samples).values():
+    for mine in _by_family(samples):
         for sample in mine:
-            pick = rng.permutation(np.flatnonzero(sample.seen | (not far_off)))[:_SAMPLE]
+            pick = rng.permutation(np.flatnonzero(sample.seen | (beyond_m is None)))[:_SAMPLE]
             error = sample.error_m[pick]
             log_error = np.log(np.clip(error, _LEAST_M, FAR_M)) - log_scale(sample.z[pick])
             rows.append(sample.evidence[pick])
-            targets.append(error > FAR_M if far_off else log_error)
+            targets.append(log_error if beyond_m is None else error > beyond_m)
             weights.append(np.full(len(pick), 1e4 / _SAMPLE / len(mine)))
     evidence, target, weight = (np.concatenate(x) for x in (rows, targets, weights))
-    settings = {"objective": "binary" if far_off else "regression"} | _TREES
+    settings = {"objective": "regression" if beyond_m is None else "binary"} | _TREES
     settings["monotone_constraints"] = list(grows.values())
     booster = lightgbm.train(settings, lightgbm.Dataset(evidence, target, weight=weight), _ROUNDS)
     trees = _as_arrays(booster.dump_model()["tree_info"])
     np.testing.assert_allclose(trees(evidence), booster.predict(evidence, raw_score=True), rtol=1e-4, atol=1e-4)
-    if far_off:
+    if beyond_m is not None:
         return trees
     off = target - trees(evidence)
     order = np.argsort(off)

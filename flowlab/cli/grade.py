@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _FAMILIES = "tabletop, hands, clutter, thin, plain, kitchen, articulated"  # a test holds it to the families there are
 
+_CAMERAS = ["fixed", "hand-held", "hand-held, poses known", "traveling", "traveling, poses known"]
 
 _ABOUT_SUMMARY = (
     "TAPVid-3D without rescaling; stated error σ; wrong: seen, above 20 mm and above 4 σ; CPU time per frame"
@@ -53,6 +54,11 @@ _ABOUT_SUMMARY = (
     help="What the simulated camera errs like  [of tasks: kinect; of scenes: by their seed]",
 )
 @click.option("--size", metavar="WxH", help="Of simulated pictures [px]  [of tasks: 320x240; of scenes: by their seed]")
+@click.option(
+    "--camera",
+    type=click.Choice(_CAMERAS),
+    help="How the camera of films moves  [by their seed: fixed or hand-held]",
+)
 @click.option("--set", "changes", multiple=True, metavar="[TRACKER.]KEY=VALUE", help="Change a tracker's option.")
 @click.option("--weights", type=PATH, help="File of a learned tracker's weights.")
 @click.option("--chunk", type=click.IntRange(min=2), help="Frames tracked at a time.")
@@ -71,6 +77,7 @@ def grade(
     seed: int,
     sensor: str | None,
     size: str | None,
+    camera: str | None,
     changes: tuple[str, ...],
     weights: Path | None,
     chunk: int | None,
@@ -106,6 +113,7 @@ def grade(
         seed=seed,
         sensor=sensor,
         size=None if size is None else _size(size),
+        camera=camera,
         settings=changes,
         weights=weights,
         chunks=_chunk_settings(chunk, stride),

@@ -116,7 +116,10 @@ class BatchBuilder:
         if rng is None:
             return points, query
         if cloud is not None and cloud.subset is not None:
-            points = rng.permutation(cloud.points)[: cloud.subset]
+            points, many = rng.permutation(cloud.points), cloud.subset
+            if cloud.subset_most is not None:
+                many = round(many * (cloud.subset_most / many) ** rng.random())
+            points = points[:many]
         if flow is not None and flow.subset is not None:
             return points, rng.permutation(self._queries.shape[1])[: flow.subset]
         return points, query

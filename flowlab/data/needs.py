@@ -17,6 +17,8 @@ class CloudNeeds:
     """Of each cloud, the first so many: farthest-point samples are nested."""
     subset: int | None = None
     """Train on a random subset of so many of them, another in each step; None trains on all."""
+    subset_most: int | None = None
+    """Draw how many that are in each step, from ``subset`` to this, small numbers as often as large ones by ratio."""
 
 
 @dataclass(frozen=True, slots=True)

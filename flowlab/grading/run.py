@@ -81,6 +81,7 @@ def grade(
     seed: int = 0,
     sensor: str | None = None,
     size: tuple[int, int] | None = None,
+    camera: str | None = None,
     settings: Sequence[str] = (),
     weights: Path | None = None,
     chunks: ChunkSettings = ChunkSettings(),
@@ -101,6 +102,8 @@ def grade(
         sensor: What the simulated camera errs like: ``kinect``, ``stereo``, ``tof`` or ``clean``. Without it tasks are
             recorded by a Kinect, and every film's seed chooses.
         size: Width and height of its pictures [px]. Without it tasks have 320 x 240, and every film's seed chooses.
+        camera: Of films, whether it is ``fixed``, ``hand-held`` or ``traveling`` past the scene; the last two also with
+            ``, poses known``. Without it every film's seed chooses, and none travels.
         settings: ``key=value`` of every tracker's options, or ``tracker.key=value`` of one tracker's.
         weights: File of a learned tracker's weights.
         chunks: How a recording is cut for trackers that take it in parts.
@@ -124,12 +127,14 @@ def grade(
         raise UsageError(
             "nothing to grade; give folders with a ground_truth.npz, --scenes tabletop,hands or --tasks hammer,push"
         )
+    if camera is not None and not scenes:
+        raise UsageError(f"--camera {camera} is of films; give --scenes tabletop,hands, too")
     workers = check_optional_count(workers, "workers")
     made = [make_graded_tracker(name, trackers, settings, weights) for name in dict.fromkeys(trackers)]
     own = [GradedRecording(folder.resolve()) for path in recordings for folder in find_with_truth(path)]
     seeds, place = range(seed, seed + episodes), (out / "recordings").resolve()
     of_tasks, tasks_made = _simulations(tasks, seeds, sensor or "kinect", size or (320, 240), place)
-    of_scenes, scenes_made = _films(scenes, seeds, sensor, size, place)
+    of_scenes, scenes_made = _films(scenes, seeds, sensor, size, camera, place)
     every = {r.folder: r for r in (*own, *of_tasks, *of_scenes)}
     with told_when_unwritable(out, "choose another --out"):
         out.mkdir(parents=True, exist_ok=True)
@@ -180,16 +185,21 @@ def _simulations(
 
 
 def _films(
-    names: Sequence[str], seeds: range, sensor: str | None, size: tuple[int, int] | None, place: Path
+    names: Sequence[str],
+    seeds: range,
+    sensor: str | None,
+    size: tuple[int, int] | None,
+    camera: str | None,
+    place: Path,
 ) -> tuple[list[GradedRecording], dict[str, Any]]:
     """The films of families of scenes, and how those are made that are not there yet."""
     if not names:
         return [], {}
     load_mujoco()
     from flowlab.grading.scenes.families import FAMILIES
-    from flowlab.grading.scenes.film import FilmSettings, check_film, make_film
+    from flowlab.grading.scenes.film import check_film, film_settings, make_film
 
-    how = FilmSettings(sensor=sensor, size=size)
+    how = film_settings(sensor=sensor, size=size, camera=camera)
     recordings = []
     for family in FAMILIES if list(names) == ["all"] else names:
         check_film(family, how)

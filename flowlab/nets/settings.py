@@ -18,6 +18,9 @@ class EncoderSettings(Settings):
     """Of each cloud, the first so many: farthest-point samples are nested."""
     subset: Width | None = 256
     """Train on a random subset of so many of them, another in each step: cheaper, and varied. null trains on all."""
+    subset_most: Annotated[Width | None, later(None)] = None
+    """Draw how many that are in each step, from ``subset`` to so many: in use all are seen. null always takes
+    ``subset``."""
     octaves: int = Field(default=1, ge=0, le=32)
     """Fourier features of the coordinates: sine and cosine of so many octaves."""
     relative: bool = True
@@ -31,6 +34,12 @@ class EncoderSettings(Settings):
     its own limits, as in DP3."""
     state_widths: tuple[Width, ...] = Field(default=(64, 64), min_length=1)
     """Layers for the robot's state; the last is the length of its vector."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "EncoderSettings":
+        if self.subset_most is not None and (self.subset is None or self.subset_most < self.subset):
+            raise ValueError(f"subset_most is at least subset; found {self.subset_most} and {self.subset}")
+        return self
 
 
 class DenoiserSettings(Settings):

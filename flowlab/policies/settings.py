@@ -22,7 +22,7 @@ class DiffusionPolicySettings(TrainSettings):
     @property
     def needs(self) -> Needs:
         """Point clouds."""
-        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset))
+        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most))
 
     @property
     def relative_to_gripper(self) -> bool:
@@ -97,7 +97,9 @@ class FDPSettings(DiffusionPolicySettings):
             scale=m.scale,
             clip=m.clip,
         )
-        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset), flow=flow)
+        return Needs(
+            point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most), flow=flow
+        )
 
     @model_validator(mode="after")
     def _motion_fits(self) -> "FDPSettings":
@@ -122,7 +124,9 @@ class MBASettings(DiffusionPolicySettings):
     @property
     def needs(self) -> Needs:
         """Point clouds and, in training, the object's pose."""
-        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset), object_pose=True)
+        return Needs(
+            point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most), object_pose=True
+        )
 
     @model_validator(mode="after")
     def _motion_fits(self) -> "MBASettings":

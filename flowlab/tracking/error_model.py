@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from importlib.resources.abc import Traversable
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -16,43 +16,53 @@ _NEAREST_M = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorModel:
-    """Two forests of gradient-boosted trees, and how much is stated of what is likely far off."""
+class Doubt:
+    """How likely errors are to be beyond some length, and what is stated because of that."""
 
     log_odds: BoostedTrees
-    """Of an error above ``FAR_M``."""
+    stated: Float64[np.ndarray, "2 k"]
+    """Log-odds, and the least error [m] that is stated then: so much that more than four times it is rare, on scenes
+    that no trees were fitted to."""
+
+    def least(self, evidence: Float[np.ndarray, "*n E"]) -> Float64[np.ndarray, "*n"]:
+        """The error [m] that is stated at least."""
+        return np.asarray(np.interp(self.log_odds(evidence), *self.stated))
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorModel:
+    """Forests of gradient-boosted trees: one of how large errors are, others of how likely they are large."""
+
     log_error: BoostedTrees
     """Of the error [m] that two in three stay below, at a depth of 1 m."""
-    far_off: Float64[np.ndarray, "2 k"]
-    """Log-odds of being far off, and the least error [m] that is stated then: so much that more than four times it is
-    rare, on scenes that neither forest was fitted to."""
+    doubts: tuple[Doubt, ...]
 
     def stated_error(
         self, evidence: Float[np.ndarray, "*n E"], z: Float[np.ndarray, "*n"]
     ) -> Float64[np.ndarray, "*n"]:
         """The error [m] that two in three of such positions stay below; more, where it is likely that they are far
         off. ``z``: their depths [m]."""
-        far = np.interp(self.log_odds(evidence), *self.far_off)
-        return np.maximum(np.exp(self.log_error(evidence) + log_scale(z)), far)
+        usual = np.exp(self.log_error(evidence) + log_scale(z))
+        return np.asarray(np.maximum.reduce([usual, *(d.least(evidence) for d in self.doubts)]))
 
     @classmethod
     def read(cls, file: Traversable) -> "ErrorModel":
         """That of a file that :meth:`write` made."""
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-            log_odds, log_error = (
-                BoostedTrees(**{f.name: arrays[f"{forest}.{f.name}"] for f in fields(BoostedTrees)})
-                for forest in ("log_odds", "log_error")
+            log_error, *log_odds = (
+                BoostedTrees(**{f.name: arrays[f"{k}.{f.name}"] for f in fields(BoostedTrees)})
+                for k in range(len(arrays) // len(fields(BoostedTrees)))
             )
-            return cls(log_odds, log_error, arrays["far_off"])
+            return cls(log_error, tuple(Doubt(d, arrays[f"{k + 1}.stated"]) for k, d in enumerate(log_odds)))
 
     def write(self, stream: BinaryIO) -> None:
         """Keep it as the arrays of an ``.npz`` file."""
-        arrays = {
-            f"{forest}.{f.name}": getattr(getattr(self, forest), f.name)
-            for forest in ("log_odds", "log_error")
-            for f in fields(BoostedTrees)
+        forests = (self.log_error, *(d.log_odds for d in self.doubts))
+        arrays: Any = {
+            f"{k}.{f.name}": getattr(forest, f.name) for k, forest in enumerate(forests) for f in fields(forest)
         }
-        np.savez_compressed(stream, far_off=self.far_off, **arrays)
+        arrays |= {f"{k + 1}.stated": doubt.stated for k, doubt in enumerate(self.doubts)}
+        np.savez_compressed(stream, **arrays)
 
 
 def log_scale(z: Float[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:

@@ -375,6 +375,17 @@ def test_random_points_and_queries_are_trained_on() -> None:
     assert seen_queries == set(range(6))
 
 
+def test_how_many_points_are_trained_on_may_be_random_too() -> None:
+    buffer, s = random_buffer(), fdp("encoder.points=20", "encoder.subset=5", "encoder.subset_most=20")
+    windows, make = every_window(buffer, s), builder(s, buffer)
+    count = [make.build(windows, np.random.default_rng(seed)).points.shape[1] for seed in range(200)]
+    assert (min(count), max(count)) == (5, 20)
+    assert 80 < sum(n < 10 for n in count) < 120, "as often by halves as by doubles"
+    assert make.build(windows).points.shape[1] == 20
+    with pytest.raises(UsageError, match="subset_most is at least subset; found 4 and 5"):
+        fdp("encoder.subset=5", "encoder.subset_most=4")
+
+
 def test_channels_are_never_a_subset_since_each_has_its_query() -> None:
     buffer, s = random_buffer(), fdp("motion.subset=3", "motion.flow_representation=channels")
     windows = every_window(buffer, s)

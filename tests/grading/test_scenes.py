@@ -1,20 +1,22 @@
 """Films of procedural scenes: their truth is what their pictures show, and what they promise of each family holds."""
 
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 from synthetic import files_below
 
-from flowlab.cli.grade import _FAMILIES
+import flowlab
+from flowlab.cli.grade import _CAMERAS, _FAMILIES
 from flowlab.errors import DataError, MissingLibraryError, UsageError
 from flowlab.grading import ground_truth
 from flowlab.grading.grade import read_clip
 from flowlab.grading.ground_truth import GroundTruth, scene_of
 from flowlab.grading.scenes.camera_paths import look_at
 from flowlab.grading.scenes.families import FAMILIES, making_films
-from flowlab.grading.scenes.film import FilmSettings, make_film
+from flowlab.grading.scenes.film import CameraMotion, FilmSettings, make_film
 from flowlab.grading.scenes.motions import carried, progress, shifted, still, turned
 from flowlab.grading.scenes.textures import make_texture
 from flowlab.grading.scenes.things import place, strip
@@ -64,6 +66,18 @@ def test_the_truth_is_what_the_pictures_show(family: str, tmp_path: Path) -> Non
     assert away[truth.role == Role.BACKGROUND].max() < 1e-4, "a table stands still before a camera that moves"
 
 
+def test_a_camera_that_is_carried_leaves_much_of_what_it_saw(tmp_path: Path) -> None:
+    clip, truth = film(tmp_path, "tabletop", settings=SMALL.model_copy(update={"camera": "traveling, poses known"}))
+    assert clip.T_world_cam is not None
+    np.testing.assert_allclose(clip.T_world_cam, truth.T_world_cam, atol=1e-6)
+    behind_near, behind_far, inside = shown(clip, truth)
+    on_surface = (behind_near > -0.002) & (behind_far < 0.002)
+    assert on_surface[truth.visible].mean() > 0.97
+    assert np.linalg.norm(clip.T_world_cam[-1, :3, 3] - clip.T_world_cam[0, :3, 3]) > 0.1
+    assert inside[0].all()
+    assert 0.05 < 1 - inside[-1].mean() < 0.9
+
+
 def test_poses_may_not_be_known(tmp_path: Path) -> None:
     settings = SMALL.model_copy(update={"camera": "hand-held", "frames": 3})
     clip, truth = film(tmp_path, "plain", settings=settings)
@@ -97,11 +111,17 @@ def test_names_that_do_not_exist(tmp_path: Path) -> None:
         make_film(tmp_path / "x", "tabeltop", 0)
     with pytest.raises(UsageError, match="no sensor is called 'kineckt'; did you mean kinect"):
         make_film(tmp_path / "x", "tabletop", 0, FilmSettings(sensor="kineckt"))
+    with pytest.raises(UsageError, match="no camera is called 'travelling'; did you mean traveling"):
+        flowlab.grade(scenes="tabletop", camera="travelling", out=tmp_path / "x")
+    with pytest.raises(UsageError, match="--camera fixed is of films; give --scenes"):
+        flowlab.grade(tasks="push", camera="fixed", out=tmp_path / "x")
+    assert not (tmp_path / "x").exists()
 
 
 def test_two_families_are_held_out_and_the_help_names_all() -> None:
     assert sum(f.held_out for f in FAMILIES.values()) == 2
     assert ", ".join(FAMILIES) == _FAMILIES
+    assert list(get_args(CameraMotion)) == _CAMERAS
 
 
 def test_trackers_are_made_with_seen_families_and_low_seeds_alone() -> None:

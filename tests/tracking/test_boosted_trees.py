@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from thoroughness import examples
 
 from flowlab.tracking.boosted_trees import BoostedTrees
-from flowlab.tracking.error_model import ErrorModel
+from flowlab.tracking.error_model import Doubt, ErrorModel
 
 Node = tuple[int, float, "Node", "Node"] | float
 """Which number, up to what it goes to the left, and both sides; or a leaf's value."""
@@ -57,19 +57,23 @@ def test_a_row_gets_the_sum_of_its_leaves(trees: list[Node], seed: int) -> None:
     np.testing.assert_allclose(found, [[sum(walk(t, row) for t in trees) for row in part] for part in rows], atol=1e-4)
 
 
-def test_an_error_model_states_what_either_forest_asks_for_also_from_its_file(tmp_path: Path) -> None:
-    log_odds, log_error = as_arrays([(0, 0.5, -6.0, 1.0)]), as_arrays([(1, 0.5, np.log(0.001), np.log(0.01))])
-    model = ErrorModel(log_odds, log_error, np.array([[-5.0, 0.0], [0.0, 0.3]]))
+def test_an_error_model_states_what_any_forest_asks_for_also_from_its_file(tmp_path: Path) -> None:
+    far, farther = (
+        Doubt(as_arrays([(k, 0.5, -6.0, 1.0)]), np.array([[-5.0, 0.0], [0.0, least]]))
+        for k, least in ((0, 0.3), (2, 0.4))
+    )
+    model = ErrorModel(as_arrays([(1, 0.5, np.log(0.001), np.log(0.01))]), (far, farther))
     with (tmp_path / "model.npz").open("wb") as stream:
         model.write(stream)
-    evidence = np.array([[0.0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]])
+    evidence = np.array([[0.0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])
     for each in (model, ErrorModel.read(tmp_path / "model.npz")):
-        np.testing.assert_allclose(each.stated_error(evidence, np.ones(4)), [0.001, 0.01, 0.3, 0.3], rtol=1e-5)
-        np.testing.assert_allclose(each.stated_error(evidence, np.full(4, 3.0)), [0.009, 0.09, 0.3, 0.3], rtol=1e-5)
+        np.testing.assert_allclose(each.stated_error(evidence, np.ones(5)), [0.001, 0.01, 0.3, 0.3, 0.4], rtol=1e-5)
+        np.testing.assert_allclose(
+            each.stated_error(evidence, np.full(5, 3.0)), [0.009, 0.09, 0.3, 0.3, 0.4], rtol=1e-5
+        )
 
 
 def test_what_is_behind_the_camera_is_no_surer_than_what_is_near() -> None:
-    leaf = as_arrays([np.log(0.002)])
-    model = ErrorModel(as_arrays([-6.0]), leaf, np.array([[-5.0, 0.0], [0.0, 0.3]]))
+    model = ErrorModel(as_arrays([np.log(0.002)]), (Doubt(as_arrays([-6.0]), np.array([[-5.0, 0.0], [0.0, 0.3]])),))
     behind, at_it, near = model.stated_error(np.zeros((3, 1)), np.array([-1.0, 0.0, 0.2]))
     assert behind == at_it == near > 0

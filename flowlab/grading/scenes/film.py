@@ -3,7 +3,7 @@
 import json
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from flowlab.config import Settings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.geometry.camera import Camera
 from flowlab.grading.graded_recording import QueryMix, made_once, write_graded
-from flowlab.grading.scenes.camera_paths import fixed_camera, hand_held
+from flowlab.grading.scenes.camera_paths import CameraPath, fixed_camera, hand_held, held_still, traveling
 from flowlab.grading.scenes.families import FAMILIES, Family
 from flowlab.grading.scenes.world import CAMERA, body_name, build_world, poses_of
 from flowlab.perception.observer import Box, ObserverSettings
@@ -30,6 +30,11 @@ _DISTANCE_M = (0.5, 1.1)
 _EVERYTHING = Box(low=(-4.0, -4.0, -2.0), high=(4.0, 4.0, 4.0))
 
 
+CameraMotion = Literal["fixed", "hand-held", "hand-held, poses known", "traveling", "traveling, poses known"]
+"""What moves the camera of a film; those that travel are not drawn, but asked for."""
+_PATHS = {"fixed": held_still, "hand-held": hand_held, "traveling": traveling}
+
+
 class FilmSettings(Settings):
     """How a film of a procedural scene is made; what is null is drawn by its seed."""
 
@@ -37,12 +42,20 @@ class FilmSettings(Settings):
     """Name of a preset of a depth camera's errors."""
     size: tuple[int, int] | None = None
     """Width and height of its pictures [px]."""
-    camera: Literal["fixed", "hand-held", "hand-held, poses known"] | None = None
-    """Whether it stands still; if not, whether the recording has its poses."""
+    camera: CameraMotion | None = None
+    """Whether it stands still; if not, whether it is carried past the scene, and whether its poses are recorded."""
     frames: int = Field(default=0, ge=0)
     """How long it is; 0 draws 40 to 80."""
     queries: QueryMix = QueryMix(background_share=0.35, object_share=0.5)
     """Which points have their truth recorded."""
+
+
+def film_settings(sensor: str | None, size: tuple[int, int] | None, camera: str | None) -> FilmSettings:
+    """Settings with names that somebody typed; raises :class:`UsageError` where one does not exist."""
+    for kind, name, known in (("sensor", sensor, tuple(PRESETS)), ("camera", camera, get_args(CameraMotion))):
+        if name is not None and name not in known:
+            raise unknown_name(kind, name, known)
+    return FilmSettings.model_validate({"sensor": sensor, "size": size, "camera": camera})
 
 
 def make_film(folder: Path, family: str, seed: int, settings: FilmSettings = FilmSettings()) -> bool:
@@ -81,17 +94,17 @@ def _film(family: Family, seed: int, settings: FilmSettings, into: Path) -> int:
     names = sorted(PRESETS)
     sensor = settings.sensor or names[rng.integers(len(names))]
     size = settings.size or _SIZES[rng.integers(len(_SIZES))]
-    kinds: tuple[str, ...] = ("fixed", "fixed", "hand-held", "hand-held, poses known")
+    kinds: tuple[CameraMotion, ...] = ("fixed", "fixed", "hand-held", "hand-held, poses known")
     camera = settings.camera or kinds[rng.integers(len(kinds))]
     steps = settings.frames or int(rng.integers(40, 81))
-    rollout = stage(family, seed, rng, size, steps, moves=camera != "fixed")
+    motion, _, known = camera.partition(", ")
+    rollout = stage(family, seed, rng, size, steps, _PATHS[motion])
     observer = ObserverSettings(crop=_EVERYTHING, drop_background=False)
-    known = camera != "hand-held"
-    return write_graded(into, rollout, PRESETS[sensor], observer, settings.queries, poses_known=known)
+    return write_graded(into, rollout, PRESETS[sensor], observer, settings.queries, poses_known=bool(known))
 
 
 def stage(
-    family: Family, seed: int, rng: np.random.Generator, size: tuple[int, int], steps: int, *, moves: bool
+    family: Family, seed: int, rng: np.random.Generator, size: tuple[int, int], steps: int, path: CameraPath
 ) -> Rollout:
     """A scene of a family as a demonstration that can be pictured, with exact poses.
 
@@ -101,7 +114,7 @@ def stage(
         rng: What everything is drawn from.
         size: Width and height of its pictures [px].
         steps: Frames.
-        moves: Whether the camera is held by a hand.
+        path: How the camera moves.
 
     Returns:
         A demonstration without state or actions.
@@ -111,7 +124,7 @@ def stage(
         raise UsageError(f"{family.name} seed {seed}: nothing found room; try another seed")
     fovy = float(rng.uniform(38, 58))
     start = fixed_camera(rng, np.array([0.0, 0.0, 0.03]), _DISTANCE_M)
-    poses_cam = hand_held(start, steps, rng) if moves else np.broadcast_to(start, (steps, 4, 4))
+    poses_cam = path(start, steps, rng)
     model = build_world(things, family.looks, fovy, rng)
     robots = frozenset(body_name(k, thing) for k, thing in enumerate(things) if thing.role == Role.ROBOT)
     scene = Scene(model, robot_roots=robots)
@@ -129,5 +142,5 @@ def stage(
         scene=scene,
         renderer=GLRenderer(scene, camera, shown),
         T_world_sim=np.eye(4),
-        T_world_cam=np.array(poses_cam) if moves else None,
+        T_world_cam=None if path is held_still else poses_cam,
     )

@@ -85,3 +85,11 @@ def test_what_could_have_slid_far_unseen_states_half_of_that() -> None:
     evidence = np.zeros((1, len(doubt.EVIDENCE)))
     evidence[0, list(doubt.EVIDENCE).index("slippage")] = 0.9
     assert doubt.stated_error(evidence, np.ones(1))[0] >= 0.45
+
+
+def test_what_left_the_picture_says_nothing_for_or_against_what_is_around() -> None:
+    cost, out = np.array([[0.1, 0.3, 0.9, 0.6]], np.float32), np.array([[False, False, True, True]])
+    cells = doubt._Cells(np.zeros((4, 3)), np.zeros(4, int), cost, out)
+    around = np.array([[0, 1], [0, 2], [2, 3]])
+    np.testing.assert_allclose(cells.misfit(around), [[0.2, 0.1, doubt._UNSEEN_COST]], rtol=1e-6)
+    np.testing.assert_allclose(cells.misfit(np.arange(4)), [0.2], rtol=1e-6)

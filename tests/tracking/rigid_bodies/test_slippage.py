@@ -119,6 +119,12 @@ def test_a_table_rests_and_what_stands_on_it_in_the_same_color_may_turn() -> Non
     assert far[len(ON_THING) :].max() < 0.005
 
 
+def test_a_table_rests_too_where_depth_ends_before_the_picture_does_and_noise_turns_its_normals() -> None:
+    clip = clip_of(on_a_table(upright_cylinder), spotted=False, noise_m=0.004)
+    clip.depth[:, :, :8] = clip.depth[:, :, -8:] = clip.depth[:, :8] = clip.depth[:, -8:] = 0
+    assert slippage_at(clip, (20, 100), (140, 105), (60, 95)).max() < 0.005
+
+
 def test_at_the_border_of_a_thing_a_point_may_be_of_it() -> None:
     clip = clip_of(upright_cylinder, spotted=False)
     left = int(np.flatnonzero(clip.depth[0, 58] < 0.9)[0])

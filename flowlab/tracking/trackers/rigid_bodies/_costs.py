@@ -48,7 +48,7 @@ def color_cost(feature, u, v, f0, shade=1.0) -> float:
     b = w00 * p[3] + w01 * q[3] + w10 * r[3] + w11 * s[3]
     color = abs(light - f0[1]) * L + abs(a - f0[2]) * A + abs(b - f0[3]) * B
     share = (light + BLACK) / (f0[1] + BLACK)
-    if DARKEST < share < 1 / DARKEST:
+    if shade < 1 and DARKEST < share < 1 / DARKEST:
         off = abs(a - GRAY - share * (f0[2] - GRAY)) * A + abs(b - GRAY - share * (f0[3] - GRAY)) * B
         color = min(color, shade + off)
     return min(texture + color, 1.0)
@@ -127,13 +127,15 @@ def motion_costs(points, point_features, frames, R, t, still_R, still_t, static,
     height, width = depth.shape[1:]
     cost, moved, through = np.zeros((3, bodies, n), np.float32)
     share = 1 / len(frames)
-    x, still, last = np.zeros(3), np.zeros(3), np.zeros((bodies, n))
+    x, still, last = np.zeros(3), np.zeros((n, 3)), np.zeros((bodies, n))
     for f in frames:
         for k in range(n):
-            _carry(still_R[f], still_t[f], points[k], still)
-            for b in range(bodies):
-                _carry(R[b, f], t[b, f], points[k], x)
-                away = (x[0] - still[0]) ** 2 + (x[1] - still[1]) ** 2 + (x[2] - still[2]) ** 2 > 1e-4
+            _carry(still_R[f], still_t[f], points[k], still[k])
+        for b in range(bodies):
+            Q, s = R[b, f], t[b, f]
+            for k in range(n):
+                _carry(Q, s, points[k], x)
+                away = (x[0] - still[k, 0]) ** 2 + (x[1] - still[k, 1]) ** 2 + (x[2] - still[k, 2]) ** 2 > 1e-4
                 if away:
                     moved[b, k] += share
                 z = x[2]
@@ -150,10 +152,10 @@ def motion_costs(points, point_features, frames, R, t, still_R, still_t, static,
                 elif off < tolerance(z):
                     color = color_cost(feature[f], u, v, point_features[k], SHADED)
                     here = 0.7 * color + 0.35 * min(off / (0.6 * tolerance(z)), 1.0)
-                    if away:
+                    if away and here < BACKGROUND:
                         before = _background_cost(x, still_R[f], still_t[f], static, depth[0], feature, f, u, v, K)
                         if before < color + AS_WELL:
-                            here = max(here, BACKGROUND)
+                            here = BACKGROUND
                     last[b, k] = here
                     cost[b, k] += here
                 elif nearest > z:
@@ -178,14 +180,13 @@ def _background_cost(x, R, t, static, depth, feature, f, u, v, K) -> float:
     """How unlike the static surface, of which x in frame f was a point already in the first frame, pixel (u, v) of
     frame f looks: 0 to 1, and 2 where x is no such point."""
     height, width = depth.shape
-    first = np.zeros(3)
-    for a in range(3):
-        first[a] = R[0, a] * (x[0] - t[0]) + R[1, a] * (x[1] - t[1]) + R[2, a] * (x[2] - t[2])
-    z = first[2]
+    dx, dy, dz = x[0] - t[0], x[1] - t[1], x[2] - t[2]  # no array: this is the innermost loop
+    z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
     if z <= 0.05:
         return 2.0
-    i = int(np.floor(first[1] / z * K[1, 1] + K[1, 2] + 0.5))
-    j = int(np.floor(first[0] / z * K[0, 0] + K[0, 2] + 0.5))
+    u0 = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / z * K[0, 0] + K[0, 2]
+    v0 = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / z * K[1, 1] + K[1, 2]
+    i, j = int(np.floor(v0 + 0.5)), int(np.floor(u0 + 0.5))
     if not (i >= 0 and j >= 0 and i < height and j < width and static[i, j]):
         return 2.0
     if abs(depth[i, j] - z) > tolerance(z):

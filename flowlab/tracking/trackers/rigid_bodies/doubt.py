@@ -17,7 +17,7 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 EVIDENCE = {
     "surroundings": 1, "worst surroundings": 1, "misfit": 1, "worst misfit": 1, "other motions around": 1, "spread": 1,
     "apart": 1, "slippage": 1, "fastest": 1, "moved": 0, "camera moved": 0, "hidden for": 0, "still": 0,
-    "cells": 0, "share of cells": 0,
+    "cells": 0, "share of cells": 0, "out of view": 0, "everything": 0,
 }  # fmt: skip
 """What doubt is told from, see :func:`evidence`, and whether more of it (1) never states less."""
 _OF_SLIPPAGE = 0.5
@@ -58,6 +58,14 @@ class _Cells:
     motion: Int64[np.ndarray, "n"]
     cost: Float32[np.ndarray, "T n"]
     """How badly every frame fits them."""
+    out_of_view: Bool[np.ndarray, "T n"]
+    """Whether their motion takes them out of the picture: nothing tells how well it fits them then."""
+
+    def misfit(self, of: Int64[np.ndarray, "*m k"]) -> Float64[np.ndarray, "T *m"]:
+        """How badly every frame fits those of them (in the mean) that it can show; what it can't is as if hidden."""
+        shown = ~self.out_of_view[:, of]
+        total = np.where(shown, self.cost[:, of], 0).sum(-1)
+        return np.where(shown.any(-1), total / np.maximum(shown.sum(-1), 1), _UNSEEN_COST)
 
 
 def evidence(
@@ -81,14 +89,15 @@ def evidence(
         almost as well, and how far the other tracker, would put it; its slippage; the longest step of its body so far
         and how far it has moved [m], before what stands still; how far that has moved itself where it was found in the
         pictures; for how many frames it has been hidden; whether it is said to stand still; and how
-        many cells are its body's, also as a share of all.
+        many cells are its body's, also as a share of all; the share of its surroundings that is out of the picture; and
+        how badly the frame fits everything.
     """
     still, xyz_cam = fit.motions[0], fit.pictures.unproject(uv.astype(float), z.astype(float))
     moved = np.linalg.norm(_undo(still, carried.xyz_cam) - xyz_cam, axis=-1)
     camera_moved = np.linalg.norm(still.apply(xyz_cam) - xyz_cam, axis=-1) * fit.pictures.still_is_fitted
     cells = _cells(fit)
     around = cKDTree(cells.xyz).query(xyz_cam, k=min(_NEAR, len(cells.xyz)))[1].reshape(len(uv), -1)
-    surroundings = cells.cost[:, around].mean(2)
+    surroundings = cells.misfit(around)
     count = np.bincount(fit.assignment.best_motion[fit.assignment.best_motion >= 0], minlength=len(fit.motions))
     columns = (
         surroundings,
@@ -106,6 +115,8 @@ def evidence(
         carried.motion == 0,
         count[carried.motion],
         count[carried.motion] / max(count.sum(), 1),
+        cells.out_of_view[:, around].mean(-1),
+        cells.misfit(np.arange(len(cells.xyz)))[:, None],
     )
     return np.stack([np.broadcast_to(c, seen.shape) for c in columns], -1).astype(np.float64)
 
@@ -116,8 +127,8 @@ def _cells(fit: RigidBodyFit) -> _Cells:
     cells = tuple(at[:: max(1, len(at) // _CELLS)].T)
     pixels = np.stack([grid.u[cells], grid.v[cells]], 1).astype(np.float32)
     xyz = pictures.unproject(pixels.astype(float), grid.depth[cells].astype(float))
-    cost, seen = _fit_of_cells(fit, owner[cells], pixels, xyz)
-    return _Cells(xyz, owner[cells], np.where(seen, cost, _UNSEEN_COST))
+    cost, seen, out_of_view = _fit_of_cells(fit, owner[cells], pixels, xyz)
+    return _Cells(xyz, owner[cells], np.where(seen, cost, _UNSEEN_COST), out_of_view)
 
 
 def _undo(motion: RigidMotion, xyz_cam: Float[np.ndarray, "T n 3"]) -> Float64[np.ndarray, "T n 3"]:
@@ -146,11 +157,13 @@ def _frames_hidden(seen: Bool[np.ndarray, "T M"]) -> Float64[np.ndarray, "T M"]:
 
 def _fit_of_cells(
     fit: RigidBodyFit, motion: np.ndarray, pixels: np.ndarray, xyz: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """How badly every frame fits cells (T, n) where their motions take them, and whether they are seen there."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How badly every frame fits cells (T, n) where their motions take them, whether they are seen there, and whether
+    that is out of the picture."""
     pictures = fit.pictures
     features = _costs.features_at(pictures.feature[0], pixels)
     cost, seen = np.empty((len(pictures), len(xyz)), np.float32), np.empty((len(pictures), len(xyz)), bool)
+    outside, (height, width) = seen.copy(), pictures.depth.shape[1:]
     for first in range(0, len(pictures), _FRAMES_AT_ONCE):
         now = slice(first, first + _FRAMES_AT_ONCE)
         path = np.empty((len(pictures.depth[now]), len(xyz), 3))
@@ -159,4 +172,5 @@ def _fit_of_cells(
         uv, z = pictures.project(path), path[..., 2]
         cost[now] = _costs.residuals(pictures.depth[now], pictures.feature[now], features, uv, z)
         seen[now] = _surfaces.is_seen(pictures.depth[now], uv, z) & (cost[now] >= 0)
-    return cost, seen
+        outside[now] = (uv < 0).any(-1) | (uv > [width - 1, height - 1]).any(-1) | (z <= 0)
+    return cost, seen, outside

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
@@ -17,6 +18,10 @@ _PLANES, _TRIED = 4, 60
 _PLANE_SHARE, _ALONG, _OFF_PLANE = 0.05, 0.97, 0.01
 """A plane has more than this share of the scene; its cells are within this cosine of its normal, and this far from it
 [m, at up to 1 m]."""
+_AROUND = (5, 5)
+"""Cells around one of which most are in a plane, if it is to be though its normal is not known."""
+_READ = 0.2
+"""A row or column of which less has depth is outside of what the depth camera sees."""
 _CURVED = 0.7
 """A plane curves less [1/m]: of a large ball, too, a part looks flat."""
 _BESIDE, _BESIDE_UNLIKE = 2.5, 6.0
@@ -63,20 +68,27 @@ def surface_patches(fit: RigidBodyFit, resting: Bool[np.ndarray, "h w"], color: 
 
 
 def resting_planes(fit: RigidBodyFit) -> Bool[np.ndarray, "h w"]:
-    """Which cells are of what things stand on or before: still planes, large and cut by the picture's border."""
+    """Which cells are of what things stand on or before: still planes, large and cut by the border of what is seen."""
     still = Patch.of(fit, np.argwhere(fit.assignment.best_motion == 0))
     found, left = np.zeros_like(fit.grid.valid), np.ones(len(still.cells), bool)
-    last = np.subtract(fit.grid.valid.shape, 1)
+    first, last = _read_part(fit.grid.valid)
     for _ in range(_PLANES):
-        mine = _largest_plane(still, left)
+        mine = left & _filled(fit, still, _largest_plane(still, left))
         if mine.sum() <= _PLANE_SHARE * fit.grid.valid.sum():
             break
         cells = still.cells[mine]
-        cut = ((cells == 0) | (cells == last)).any()
+        cut = ((cells <= first) | (cells >= last)).any()
         if cut and _curvature(still.xyz_cam[mine]) < _CURVED:
             found[tuple(cells.T)] = True
         left &= ~mine
     return found
+
+
+def _read_part(valid: Bool[np.ndarray, "h w"]) -> tuple[Int64[np.ndarray, "2"], Int64[np.ndarray, "2"]]:
+    """First and last row and column of the cells that have depth: a picture of depth that was brought to the color
+    camera has none around."""
+    along = [np.flatnonzero(valid.mean(axis) > _READ) for axis in (1, 0)]
+    return np.array([a[0] if len(a) else 0 for a in along]), np.array([a[-1] if len(a) else 0 for a in along])
 
 
 def _largest_plane(patch: Patch, left: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
@@ -84,7 +96,7 @@ def _largest_plane(patch: Patch, left: Bool[np.ndarray, "n"]) -> Bool[np.ndarray
     known = np.linalg.norm(patch.normals, axis=1) > 0.5
     some = np.flatnonzero(known & left)
     best = np.zeros(len(left), bool)
-    near = _OFF_PLANE * np.maximum(1, patch.xyz_cam[:, 2])
+    near = _off_plane(patch)
     for k in some[np.linspace(0, len(some) - 1, min(_TRIED, len(some))).astype(int)]:
         normal = patch.normals[k] / np.linalg.norm(patch.normals[k])
         along = ~known | (patch.normals @ normal > _ALONG)
@@ -92,6 +104,26 @@ def _largest_plane(patch: Patch, left: Bool[np.ndarray, "n"]) -> Bool[np.ndarray
         if mine.sum() > best.sum():
             best = mine
     return best
+
+
+def _filled(fit: RigidBodyFit, patch: Patch, mine: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """With the cells in the plane that look like most of those around, which are: noise turns normals any way."""
+    if not mine.any():
+        return mine
+    center = patch.xyz_cam[mine].mean(0)
+    normal = np.linalg.eigh(np.cov(patch.xyz_cam[mine] - center, rowvar=False, bias=True))[1][:, 0]
+    at, mask = tuple(patch.cells.T), np.zeros(fit.grid.valid.shape, np.float32)
+    mask[tuple(patch.cells[mine].T)] = 1
+    color = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
+    share, total = cv2.blur(mask, _AROUND)[at], cv2.blur(mask[..., None] * color, _AROUND)[at]
+    alike = (np.abs(color[at] - total / np.maximum(share, 1e-6)[:, None]) <= _UNLIKE).all(1)
+    return mine | ((share > 0.5) & alike & (np.abs((patch.xyz_cam - center) @ normal) < _off_plane(patch)))
+
+
+def _off_plane(patch: Patch) -> Float64[np.ndarray, "n"]:
+    """How far [m] cells may be from a plane that they are of: a triangulating camera's noise grows with the square of
+    depth."""
+    return _OFF_PLANE * np.maximum(1, patch.xyz_cam[:, 2] ** 2)
 
 
 def _curvature(xyz: Float64[np.ndarray, "n 3"]) -> float:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int32
 
 from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch, rotate
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY, find_again
+from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY, NewPlaces, find_again
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid
 
 _POINTS_PER_BODY = 400
@@ -67,9 +67,7 @@ def track_poses(
         lightness = pictures.lightness(t)
         best.try_poses(slice(None), *_evaluate(batch, t, *batch.align(t, best.R, best.s, lightness)), slack=1e-3)
         _borrow_motions(batch, t, best, R[t - 1], s[t - 1], lightness)
-        for k in np.flatnonzero(best.energy > LOST_ENERGY):
-            if found := find_again(batch, t, int(k), seen_R[k], lightness):
-                best.R[k], best.s[k], best.energy[k], best.seen[k] = found
+        _find_lost(batch, t, best, seen_R, lightness)
         R[t], s[t], energy = best.R, best.s, best.energy
         good = (best.seen > 0.4) & (energy < 0.5)
         seen_R[good], seen_s[good] = R[t, good], s[t, good]
@@ -199,6 +197,16 @@ def _carried_by_flow(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> tuple[n
     z = pictures.depth[t, i, j].astype(float)
     ok &= (z > 0) & (np.abs(z - xyz[:, 2]) < 0.03)
     return pictures.unproject(q, z), ok
+
+
+def _find_lost(batch: BodyBatch, t: int, best: _BestPoses, seen_R: np.ndarray, lightness: np.ndarray) -> None:
+    """Look for bodies that are lost all over the picture, turned as they were when they were last seen."""
+    lost = np.flatnonzero(best.energy > LOST_ENERGY)
+    if len(lost):
+        new = NewPlaces.of(batch.pictures, t)
+        for k in lost:
+            if found := find_again(batch, t, int(k), seen_R[k], lightness, new):
+                best.R[k], best.s[k], best.energy[k], best.seen[k] = found
 
 
 def _borrow_motions(

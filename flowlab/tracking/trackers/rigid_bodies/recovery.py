@@ -1,5 +1,7 @@
 """A body that was lost, out of the picture or behind something, is looked for wherever something new is seen."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
@@ -19,8 +21,8 @@ _STEP = 4
 """Every how many pixels, both ways, a place is tried."""
 _LIKE, _AS_BEFORE = 0.6, 0.35
 """Costs of color below which a pixel may show the body's middle, and below which it shows what it did at first."""
-_AROUND = 5
-"""Side [px] of the window whose mean color is compared, too: a texture may be finer than the places."""
+_WINDOW = (5, 5)
+"""[px], of the window whose mean color is compared, too: a texture may be finer than the places."""
 _NEARBY_PX = np.array([(x, y, 0.0) for y in range(-2, 3) for x in range(-2, 3)])
 """Shifts between places."""
 _FIRST_POINTS, _BEST, _REFINED = 50, 8, 4
@@ -28,8 +30,9 @@ _FIRST_POINTS, _BEST, _REFINED = 50, 8, 4
 
 
 def find_again(
-    batch: BodyBatch, t: int, k: int, R: Float64[np.ndarray, "3 3"], lightness: Float32[np.ndarray, "h w"]
-) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    batch: BodyBatch, t: int, k: int, R: Float64[np.ndarray, "3 3"], lightness: Float32[np.ndarray, "h w"],
+    new: "NewPlaces",
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:  # fmt: skip
     """A pose in which a lost body explains a frame well, wherever in the picture that is.
 
     Args:
@@ -38,11 +41,13 @@ def find_again(
         k: Which of them is lost.
         R: How it was turned when it was last seen.
         lightness: Of the frame.
+        new: Where it may be.
 
     Returns:
         R, s, the energy and the seen share; None where there is no such pose.
     """
-    anchor, places = _middle(batch, k), _new_places(batch, t, k)
+    anchor = _middle(batch, k)
+    places = new.like(batch.pictures, anchor)
     if len(places) == 0:
         return None
     every = max(1, batch.points.shape[1] // _FIRST_POINTS)
@@ -71,20 +76,38 @@ def _best(
     return places[best], energy[best]
 
 
-def _new_places(batch: BodyBatch, t: int, k: int) -> Float64[np.ndarray, "n 3"]:
-    """Where [m] frame t shows something colored like the middle of body k that did not stand there at first."""
-    pictures, middle = batch.pictures, _middle(batch, k)
-    first, now = (cv2.blur(pictures.feature[f], (_AROUND, _AROUND))[..., 1:] for f in (0, t))
-    height, width = pictures.depth.shape[1:]
-    v, u = (x.ravel() for x in np.mgrid[0:height:_STEP, 0:width:_STEP])
-    j, i = np.rint(pictures.project(middle)).astype(int).clip(0, [width - 1, height - 1])
-    like = _unlike(now[v, u], first[i, j]) < _LIKE
-    like |= _unlike(pictures.feature[t, v, u, 1:], pictures.feature[0, i, j, 1:]) < _LIKE
-    z = pictures.depth[t, v, u]
-    like &= (z > middle[2] / _CLOSER) & (z < middle[2] * _CLOSER)
-    u, v = u[like], v[like]
-    xyz = pictures.unproject(np.stack([u, v], -1).astype(float), pictures.depth[t, v, u].astype(float))
-    return xyz[~_stood_there(pictures, t, xyz, pictures.feature[t, v, u, 1:])]
+@dataclass(frozen=True, slots=True)
+class NewPlaces:
+    """Where a frame shows what did not stand there in the first, a grid of pixels."""
+
+    xyz: Float64[np.ndarray, "n 3"]
+    """[m]."""
+    color: UInt8[np.ndarray, "n 3"]
+    """Lightness, a and b."""
+    around: UInt8[np.ndarray, "n 3"]
+    """The mean of those around it."""
+
+    @classmethod
+    def of(cls, pictures: ClipFeatures, t: int) -> "NewPlaces":
+        """Those of frame t."""
+        grid = pictures.feature[t, ::_STEP, ::_STEP, 1:].reshape(-1, 3)
+        v, u = (x.ravel() for x in np.mgrid[: len(pictures.depth[t]) : _STEP, : pictures.depth.shape[2] : _STEP])
+        z = pictures.depth[t, v, u].astype(float)
+        xyz = pictures.unproject(np.stack([u, v], -1).astype(float), z)
+        new = np.flatnonzero(z > 0)
+        new = new[~_stood_there(pictures, t, xyz[new], grid[new])]
+        return cls(xyz[new], grid[new], cv2.blur(pictures.feature[t], _WINDOW)[v[new], u[new], 1:])
+
+    def like(self, pictures: ClipFeatures, middle: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "k 3"]:
+        """Those of a color and about the depth of a point of the first frame."""
+        height, width = pictures.depth.shape[1:]
+        j, i = np.rint(pictures.project(middle)).astype(int).clip(0, [width - 1, height - 1])
+        top, left = max(i - _WINDOW[0], 0), max(j - _WINDOW[0], 0)
+        beside = pictures.feature[0, top : i + _WINDOW[0] + 1, left : j + _WINDOW[0] + 1, 1:]
+        around, z = cv2.blur(beside, _WINDOW)[i - top, j - left], self.xyz[:, 2]
+        like = (z > middle[2] / _CLOSER) & (z < middle[2] * _CLOSER)
+        like &= (_unlike(self.around, around) < _LIKE) | (_unlike(self.color, pictures.feature[0, i, j, 1:]) < _LIKE)
+        return self.xyz[like]
 
 
 def _middle(batch: BodyBatch, k: int) -> Float64[np.ndarray, "3"]:

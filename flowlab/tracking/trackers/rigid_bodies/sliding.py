@@ -1,12 +1,11 @@
 """A surface that slides along itself, step by step: a ball that turns, a cup on its axis, a board in its plane."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
@@ -35,42 +34,62 @@ class SlidingSurface:
         some = np.random.default_rng(0).permutation(len(xyz))[:_POINTS]
         return cls(xyz, normals, cKDTree(xyz), xyz[some])
 
-    def slide(
-        self, turn: Float64[np.ndarray, "3"], shift: Float64[np.ndarray, "3"], center: Float64[np.ndarray, "3"]
-    ) -> Iterator[RigidMotion]:
-        """Steps of a turn about a center and a shift: one of them, two, and so on, each put back onto the surface."""
-        speed = np.linalg.norm(np.cross(turn, self.xyz - center) + shift, axis=1).max()
-        size = min(_STEP_M / max(speed, 1e-9), _STEP_TURN / max(float(np.linalg.norm(turn)), 1e-9))
-        step = _screw(size * turn, size * (shift - np.cross(turn, center)))
-        motion = RigidMotion.identity(1)
+    def slides(
+        self, turns: Float64[np.ndarray, "K 3"], shifts: Float64[np.ndarray, "K 3"], center: Float64[np.ndarray, "3"]
+    ) -> RigidMotion:
+        """Steps of turns about a center and shifts: of each one step, two, and so on, each put back onto the surface.
+
+        Returns:
+            As many motions of one frame as there are steps, as the frames of one.
+        """
+        speed = np.linalg.norm(np.cross(turns[:, None], self.xyz - center) + shifts[:, None], axis=-1).max(1)
+        size = np.minimum(
+            _STEP_M / np.maximum(speed, 1e-9), _STEP_TURN / np.maximum(np.linalg.norm(turns, axis=1), 1e-9)
+        )[:, None]
+        step = _screws(size * turns, size * (shifts - np.cross(turns, center)))
+        motion, steps = RigidMotion.identity(len(turns)), []
         for _ in range(STEPS):
             motion = self._put_back(step @ motion)
-            yield motion
+            steps.append(motion)
+        R, t = np.stack([m.R for m in steps], 1), np.stack([m.t for m in steps], 1)
+        return RigidMotion(R.reshape(-1, 3, 3), t.reshape(-1, 3))
 
     def _put_back(self, motion: RigidMotion) -> RigidMotion:
-        """A motion, changed by the least that takes the points onto the surface (point to plane)."""
+        """Motions, changed by the least that takes the points onto the surface (point to plane)."""
         for _ in range(_CORRECTIONS):
-            moved = motion.apply(self.sliding)[0]
+            moved = motion.apply(self.sliding)
             at = np.asarray(self.tree.query(moved)[1])
-            known = np.linalg.norm(self.normals[at], axis=1) > 0.5
-            on = known & (np.linalg.norm(moved - self.xyz[at], axis=1) < _STEP_M / 2)
-            if on.sum() < _MIN_POINTS:
-                break
-            center, normals = moved[on].mean(0), self.normals[at[on]]
-            radius = np.sqrt(((moved[on] - center) ** 2).sum(1).mean()) + 1e-6
-            rows = np.concatenate([np.cross(moved[on] - center, normals) / radius, normals], 1)
-            off = ((moved[on] - self.xyz[at[on]]) * normals).sum(1)
-            twist = -np.linalg.lstsq(rows, off, rcond=_FREE)[0]
-            turn = twist[:3] / radius
-            motion = _screw(turn, twist[3:] - np.cross(turn, center)) @ motion
+            normals, off = self.normals[at], moved - self.xyz[at]
+            on = (np.linalg.norm(normals, axis=-1) > 0.5) & (np.linalg.norm(off, axis=-1) < _STEP_M / 2)
+            count = np.maximum(on.sum(1), 1)
+            center = (moved * on[..., None]).sum(1) / count[:, None]
+            away = (moved - center[:, None]) * on[..., None]
+            radius = np.sqrt((away**2).sum((1, 2)) / count)[:, None] + 1e-6
+            rows = np.concatenate([np.cross(away, normals) / radius[..., None], normals * on[..., None]], -1)
+            twist = -_least_squares(rows, (off * normals).sum(-1))
+            twist[on.sum(1) < _MIN_POINTS] = 0
+            turn = twist[:, :3] / radius
+            motion = _screws(turn, twist[:, 3:] - np.cross(turn, center)) @ motion
         return motion
 
 
-def _screw(turn: np.ndarray, shift: np.ndarray) -> RigidMotion:
-    """The motion that a turn about the origin [rad] and a shift [m] are at once: the exponential of their twist."""
-    R, angle = cv2.Rodrigues(turn)[0], float(np.linalg.norm(turn))
-    if angle < 1e-9:
-        return RigidMotion(R[None], shift[None])
-    axis = turn / angle
-    t = axis * (axis @ shift) + (np.eye(3) - R) @ np.cross(axis, shift) / angle
-    return RigidMotion(R[None], t[None])
+def _least_squares(
+    rows: Float64[np.ndarray, "K n 6"], values: Float64[np.ndarray, "K n"]
+) -> Float64[np.ndarray, "K 6"]:
+    """What rows times it comes nearest to the values, 0 in directions that tell little."""
+    across = rows.swapaxes(1, 2)
+    told, axes = np.linalg.eigh(across @ rows)  # squares of singular values
+    enough = told > np.maximum(_FREE**2 * told[:, -1:], 1e-12)
+    along = (axes.swapaxes(1, 2) @ (across @ values[..., None]))[..., 0]
+    return (axes @ (np.where(enough, along, 0) / np.where(enough, told, 1))[..., None])[..., 0]
+
+
+def _screws(turns: Float64[np.ndarray, "K 3"], shifts: Float64[np.ndarray, "K 3"]) -> RigidMotion:
+    """The motions that turns about the origin [rad] and shifts [m] are at once: the exponentials of their twists."""
+    R, angle = Rotation.from_rotvec(turns).as_matrix(), np.linalg.norm(turns, axis=1, keepdims=True)
+    some = angle > 1e-9
+    angle = np.where(some, angle, 1)
+    axis = turns / angle
+    left = (np.cross(axis, shifts)[:, None] @ (np.eye(3) - R).swapaxes(1, 2))[:, 0]
+    t = axis * (axis * shifts).sum(1, keepdims=True) + left / angle
+    return RigidMotion(R, np.where(some, t, shifts))

@@ -4,7 +4,6 @@ Slippage analysis (Gelfand and Guibas 2004): the motions of a surface along itse
 eigenvalues of its normals' point-to-plane covariance. Each is tried on the pictures, since color may still tell.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -56,23 +55,24 @@ def slippage(fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "M 3"]) -> Float64[
 
 @dataclass(frozen=True, slots=True)
 class _Comparison:
-    """Some frames of a clip, without lightness: shading does not turn with what is turned."""
+    """Some frames of a clip."""
 
     fit: RigidBodyFit
     frames: Int64[np.ndarray, "F"]
     depth: Float32[np.ndarray, "F H W"]
     """[m]."""
-    feature: UInt8[np.ndarray, "F H W 4"]
-    first: UInt8[np.ndarray, "H W 4"]
+    lit: tuple[UInt8[np.ndarray, "F H W 4"], UInt8[np.ndarray, "H W 4"]]
+    """Features of them, and of the first: a room takes its lamps along when it moves before the camera."""
+    unlit: tuple[UInt8[np.ndarray, "F H W 4"], UInt8[np.ndarray, "H W 4"]]
+    """The same without lightness: shading does not turn with what is turned."""
 
     @classmethod
     def of(cls, fit: RigidBodyFit) -> "_Comparison":
         last = len(fit.pictures) - 1
         frames = np.unique(np.linspace(1, last, min(last, _FRAMES)).round().astype(int))
-        pictures = fit.pictures
-        return cls(
-            fit, frames, pictures.depth[frames], _unshaded(pictures.feature[frames]), _unshaded(pictures.feature[0])
-        )
+        feature = fit.pictures.feature
+        lit = feature[frames], feature[0]
+        return cls(fit, frames, fit.pictures.depth[frames], lit, (_unshaded(lit[0]), _unshaded(lit[1])))
 
     def unnoticed(
         self, surface: Patch, points: Float[np.ndarray, "m 3"], whole: bool = False
@@ -86,12 +86,13 @@ class _Comparison:
         some = np.random.default_rng(0).permutation(some)[: _CELLS_OF_ALL if whole else _CELLS]
         xyz, pixels = surface.xyz_cam[some], surface.pixels[some].astype(np.float32)
         own = self.fit.motions[self.fit.assignment.best_motion[tuple(surface.cells[0])]]
-        slips = list(_slips(self.fit, surface))
-        R = np.stack([own.R[self.frames]] + [own.R[self.frames] @ s.R[0] for s in slips])
-        t = np.stack([own.t[self.frames]] + [own.R[self.frames] @ s.t[0] + own.t[self.frames] for s in slips])
-        features, K = _costs.features_at(self.first, pixels), self.fit.pictures.K
-        rise = _slipping.cost_rise(xyz, features, R, t, self.depth, self.feature, K, not whole)
-        distance = np.stack([np.linalg.norm(s.apply(points)[0] - points, axis=1) for s in slips])
+        slips, own_R, own_t = _slips(self.fit, surface), own.R[self.frames], own.t[self.frames]
+        R = np.concatenate([own_R[None], own_R @ slips.R[:, None]])
+        t = np.concatenate([own_t[None], (own_R @ slips.t[:, None, :, None])[..., 0] + own_t])
+        pictures, first = self.lit if whole else self.unlit
+        features, K = _costs.features_at(first, pixels), self.fit.pictures.K
+        rise = _slipping.cost_rise(xyz, features, R, t, self.depth, pictures, K, not whole)
+        distance = np.linalg.norm(slips.apply(points) - points, axis=-1)
         hidden = np.exp(-((np.maximum(rise, 0) / (_NOTICED_OF_ALL if whole else _NOTICED)) ** 4)).reshape(-1, STEPS)
         on_the_way = np.cumprod(hidden, axis=1)  # what is seen half the way is seen
         return np.asarray((distance * on_the_way.reshape(-1, 1)).max(0))
@@ -114,18 +115,17 @@ def _inner(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return inner if len(inner) >= _MIN_INNER else np.arange(len(cells))
 
 
-def _slips(fit: RigidBodyFit, surface: Patch) -> Iterator[RigidMotion]:
-    """Motions, of one frame each, that may take a surface along itself, this way and back, ever farther."""
+def _slips(fit: RigidBodyFit, surface: Patch) -> RigidMotion:
+    """Motions, each a frame of one, that may take a surface along itself, this way and back, ever farther."""
     center = surface.xyz_cam.mean(0)
     radius = np.sqrt(((surface.xyz_cam - center) ** 2).sum(1).mean()) + 1e-6
     known = np.linalg.norm(surface.normals, axis=1) > 0.5
     along = _covariance(surface.xyz_cam[known], surface.normals[known], center, radius)
     contour = _covariance(*_contour(fit, surface), center, radius)
-    twists = [*np.linalg.eigh(along)[1][:, :3].T, np.linalg.eigh(along + contour)[1][:, 0]]
+    twists = np.stack([*np.linalg.eigh(along)[1][:, :3].T, np.linalg.eigh(along + contour)[1][:, 0]])
+    both_ways = np.stack([twists, -twists], 1).reshape(-1, 6)
     sliding = SlidingSurface.of(surface.xyz_cam, surface.normals)
-    for twist in twists:
-        for sign in (1, -1):
-            yield from sliding.slide(sign * twist[:3] / radius, sign * twist[3:], center)
+    return sliding.slides(both_ways[:, :3] / radius, both_ways[:, 3:], center)
 
 
 def _covariance(xyz: np.ndarray, normals: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
