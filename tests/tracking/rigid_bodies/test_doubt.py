@@ -92,4 +92,3 @@ def test_what_left_the_picture_says_nothing_for_or_against_what_is_around() -> N
     cells = doubt._Cells(np.zeros((4, 3)), np.zeros(4, int), cost, out)
     around = np.array([[0, 1], [0, 2], [2, 3]])
     np.testing.assert_allclose(cells.misfit(around), [[0.2, 0.1, doubt._UNSEEN_COST]], rtol=1e-6)
-    np.testing.assert_allclose(cells.misfit(np.arange(4)), [0.2], rtol=1e-6)

@@ -17,7 +17,7 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 EVIDENCE = {
     "surroundings": 1, "worst surroundings": 1, "misfit": 1, "worst misfit": 1, "other motions around": 1, "spread": 1,
     "apart": 1, "slippage": 1, "fastest": 1, "moved": 0, "camera moved": 0, "hidden for": 0, "still": 0,
-    "cells": 0, "share of cells": 0, "out of view": 0, "everything": 0,
+    "cells": 0, "share of cells": 0, "out of view": 0,
 }  # fmt: skip
 """What doubt is told from, see :func:`evidence`, and whether more of it (1) never states less."""
 _OF_SLIPPAGE = 0.5
@@ -89,8 +89,7 @@ def evidence(
         almost as well, and how far the other tracker, would put it; its slippage; the longest step of its body so far
         and how far it has moved [m], before what stands still; how far that has moved itself where it was found in the
         pictures; for how many frames it has been hidden; whether it is said to stand still; and how
-        many cells are its body's, also as a share of all; the share of its surroundings that is out of the picture; and
-        how badly the frame fits everything.
+        many cells are its body's, also as a share of all; and the share of its surroundings that is out of the picture.
     """
     still, xyz_cam = fit.motions[0], fit.pictures.unproject(uv.astype(float), z.astype(float))
     moved = np.linalg.norm(_undo(still, carried.xyz_cam) - xyz_cam, axis=-1)
@@ -116,7 +115,6 @@ def evidence(
         count[carried.motion],
         count[carried.motion] / max(count.sum(), 1),
         cells.out_of_view[:, around].mean(-1),
-        cells.misfit(np.arange(len(cells.xyz)))[:, None],
     )
     return np.stack([np.broadcast_to(c, seen.shape) for c in columns], -1).astype(np.float64)
 
