@@ -71,6 +71,14 @@ def test_worse_evidence_never_states_less(of: ModuleType, data: st.DataObject) -
 
 
 @pytest.mark.parametrize("of", [doubt, uncertainty])
+def test_trees_know_no_other_evidence(of: ModuleType) -> None:
+    model = of.error_model()
+    assert all(
+        forest.column.max() < len(of.EVIDENCE) for forest in (model.log_error, *(d.log_odds for d in model.doubts))
+    )
+
+
+@pytest.mark.parametrize("of", [doubt, uncertainty])
 def test_it_grows_with_the_square_of_depth_beyond_what_was_seen(of: ModuleType) -> None:
     near, far = of.error_model().stated_error(np.zeros((2, len(of.EVIDENCE))), np.array([10.0, 30]))
     assert far / near == pytest.approx(9, rel=1e-4)
