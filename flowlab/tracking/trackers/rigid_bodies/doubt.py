@@ -88,8 +88,8 @@ def evidence(
         the point itself; the share of its surroundings that has another motion; how far [m] motions that explain it
         almost as well, and how far the other tracker, would put it; its slippage; the longest step of its body so far
         and how far it has moved [m], before what stands still; how far that has moved itself where it was found in the
-        pictures; for how many frames it has been hidden; whether it is said to stand still; and how
-        many cells are its body's, also as a share of all; and the share of its surroundings that is out of the picture.
+        pictures; for how many frames it has been hidden; whether it is said to stand still; how many
+        cells are its body's, also as a share of all; and the share of its surroundings that is out of the picture.
     """
     still, xyz_cam = fit.motions[0], fit.pictures.unproject(uv.astype(float), z.astype(float))
     moved = np.linalg.norm(_undo(still, carried.xyz_cam) - xyz_cam, axis=-1)
