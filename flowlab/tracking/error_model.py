@@ -51,7 +51,7 @@ class ErrorModel:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             log_error, *log_odds = (
                 BoostedTrees(**{f.name: arrays[f"{k}.{f.name}"] for f in fields(BoostedTrees)})
-                for k in range(len(arrays) // len(fields(BoostedTrees)))
+                for k in range(sum(name.endswith(".root") for name in arrays))
             )
             return cls(log_error, tuple(Doubt(d, arrays[f"{k + 1}.stated"]) for k, d in enumerate(log_odds)))
 

@@ -125,6 +125,14 @@ def test_a_table_rests_too_where_depth_ends_before_the_picture_does_and_noise_tu
     assert slippage_at(clip, (20, 100), (140, 105), (60, 95)).max() < 0.005
 
 
+@pytest.mark.parametrize(("at_m", "radius_m", "behind_m"), [(0.6, 0.1, 0.0), (0.6, 0.1, 6.0), (1.8, 0.25, 1.83)])
+def test_a_plate_alone_or_near_a_wall_of_other_colors_is_no_wall(at_m: float, radius_m: float, behind_m: float) -> None:
+    plate = lambda ray: np.where(np.hypot(ray[..., 0], ray[..., 1]) * at_m < radius_m, at_m, np.inf)  # noqa: E731
+    clip = clip_of(plate, spotted=False)
+    clip.depth[clip.depth == WALL] = behind_m
+    assert slippage_at(clip, *ON_THING).min() > 0.02, "it looks the same when it is turned"
+
+
 def test_at_the_border_of_a_thing_a_point_may_be_of_it() -> None:
     clip = clip_of(upright_cylinder, spotted=False)
     left = int(np.flatnonzero(clip.depth[0, 58] < 0.9)[0])

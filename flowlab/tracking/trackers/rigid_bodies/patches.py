@@ -20,8 +20,9 @@ _PLANE_SHARE, _ALONG, _OFF_PLANE = 0.05, 0.97, 0.01
 [m, at up to 1 m]."""
 _AROUND = (5, 5)
 """Cells around one of which most are in a plane, if it is to be though its normal is not known."""
-_READ = 0.2
-"""A row or column of which less has depth is outside of what the depth camera sees."""
+_FRAME, _RAGGED, _READ, _STRAY = 0.15, 3, 0.5, 0.02
+"""A frame without depth is at most this share of the picture wide; within so many cells it gives way to rows of which
+this share has depth, and before these hardly any has."""
 _CURVED = 0.7
 """A plane curves less [1/m]: of a large ball, too, a part looks flat."""
 _BESIDE, _BESIDE_UNLIKE = 2.5, 6.0
@@ -71,7 +72,7 @@ def resting_planes(fit: RigidBodyFit) -> Bool[np.ndarray, "h w"]:
     """Which cells are of what things stand on or before: still planes, large and cut by the border of what is seen."""
     still = Patch.of(fit, np.argwhere(fit.assignment.best_motion == 0))
     found, left = np.zeros_like(fit.grid.valid), np.ones(len(still.cells), bool)
-    first, last = _read_part(fit.grid.valid)
+    first, last = _read_part(fit)
     for _ in range(_PLANES):
         mine = left & _filled(fit, still, _largest_plane(still, left))
         if mine.sum() <= _PLANE_SHARE * fit.grid.valid.sum():
@@ -84,11 +85,26 @@ def resting_planes(fit: RigidBodyFit) -> Bool[np.ndarray, "h w"]:
     return found
 
 
-def _read_part(valid: Bool[np.ndarray, "h w"]) -> tuple[Int64[np.ndarray, "2"], Int64[np.ndarray, "2"]]:
-    """First and last row and column of the cells that have depth: a picture of depth that was brought to the color
-    camera has none around."""
-    along = [np.flatnonzero(valid.mean(axis) > _READ) for axis in (1, 0)]
-    return np.array([a[0] if len(a) else 0 for a in along]), np.array([a[-1] if len(a) else 0 for a in along])
+def _read_part(fit: RigidBodyFit) -> tuple[Int64[np.ndarray, "2"], Int64[np.ndarray, "2"]]:
+    """First and last row and column of the cells that the depth camera sees.
+
+    These are the picture's, but where a frame of it never has depth, as in one that was brought to the color camera. A
+    thing before what is too far away to have depth has no such straight border at the picture's own.
+    """
+    ever = fit.pictures.depth.max(0)[::STEP, ::STEP] > 0
+    sides = [(_frame(ever.mean(axis)), _frame(ever.mean(axis)[::-1])) for axis in (1, 0)]
+    return (
+        np.array([before for before, _ in sides]),
+        np.array([n - 1 - after for n, (_, after) in zip(ever.shape, sides, strict=True)]),
+    )
+
+
+def _frame(share: Float64[np.ndarray, "n"]) -> int:
+    """How many rows at the beginning have no depth, told by the share of each that has; 0 if that is no frame."""
+    read = np.flatnonzero(share > _READ)
+    if len(read) == 0 or read[0] > _FRAME * len(share) or (share[: max(read[0] - _RAGGED, 0)] > _STRAY).any():
+        return 0
+    return int(read[0])
 
 
 def _largest_plane(patch: Patch, left: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
@@ -96,7 +112,7 @@ def _largest_plane(patch: Patch, left: Bool[np.ndarray, "n"]) -> Bool[np.ndarray
     known = np.linalg.norm(patch.normals, axis=1) > 0.5
     some = np.flatnonzero(known & left)
     best = np.zeros(len(left), bool)
-    near = _off_plane(patch)
+    near = _OFF_PLANE * np.maximum(1, patch.xyz_cam[:, 2])
     for k in some[np.linspace(0, len(some) - 1, min(_TRIED, len(some))).astype(int)]:
         normal = patch.normals[k] / np.linalg.norm(patch.normals[k])
         along = ~known | (patch.normals @ normal > _ALONG)
@@ -117,13 +133,8 @@ def _filled(fit: RigidBodyFit, patch: Patch, mine: Bool[np.ndarray, "n"]) -> Boo
     color = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
     share, total = cv2.blur(mask, _AROUND)[at], cv2.blur(mask[..., None] * color, _AROUND)[at]
     alike = (np.abs(color[at] - total / np.maximum(share, 1e-6)[:, None]) <= _UNLIKE).all(1)
-    return mine | ((share > 0.5) & alike & (np.abs((patch.xyz_cam - center) @ normal) < _off_plane(patch)))
-
-
-def _off_plane(patch: Patch) -> Float64[np.ndarray, "n"]:
-    """How far [m] cells may be from a plane that they are of: a triangulating camera's noise grows with the square of
-    depth."""
-    return _OFF_PLANE * np.maximum(1, patch.xyz_cam[:, 2] ** 2)
+    near = _OFF_PLANE * np.maximum(1, patch.xyz_cam[:, 2] ** 2)  # as a triangulating camera's noise grows
+    return mine | ((share > 0.5) & alike & (np.abs((patch.xyz_cam - center) @ normal) < near))
 
 
 def _curvature(xyz: Float64[np.ndarray, "n 3"]) -> float:
