@@ -87,6 +87,22 @@ def check_optional_count(value: Any, name: str, least: int = 1) -> int | None:
     return None if value is None else check_count(value, name, least)
 
 
+def check_optional_name(value: Any, name: str) -> str | None:
+    """A name, or None. Raises :class:`UsageError` for anything else."""
+    if value is not None and not (isinstance(value, str) and value):
+        raise _wrong(name, value, "a name")
+    return value
+
+
+def check_size(value: Any, name: str) -> tuple[int, int] | None:
+    """A width and a height, or None. Raises :class:`UsageError` for anything else."""
+    if value is None:
+        return None
+    if (listed := _listed(value, Integral)) is None or len(listed) != 2:
+        raise _wrong(name, value, f"a width and a height, as in {name}=(320, 240)")
+    return check_count(listed[0], name), check_count(listed[1], name)
+
+
 def check_counts(value: Any, name: str, least: int | None = 0) -> tuple[int, ...]:
     """Whole numbers, or one of them. Raises :class:`UsageError` for anything else."""
     if isinstance(value, Integral):

@@ -78,8 +78,9 @@ class RecordingGrade:
 
     @property
     def scene(self) -> str:
-        """The family of procedural scenes or the task that it is of; empty for a recording of somebody's own."""
-        return self.origin.scene
+        """The family of procedural scenes or the task that it is of, and the camera that was asked for; empty for a
+        recording of somebody's own."""
+        return ", ".join(filter(None, (self.origin.scene, self.origin.camera)))
 
     @property
     def ms_per_frame(self) -> float:

@@ -1,13 +1,14 @@
-"""What a recording with known truth says of its own making: its scene, its seed, its sensor."""
+"""What a recording with known truth says of its own making: its scene, its seed, its sensor, its camera."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationError
 
 from flowlab.grading.ground_truth import MADE_WITH, scene_of
+from flowlab.grading.scenes.camera_paths import CameraMotion
 from flowlab.untrusted import read_json
 
 BY_SEED = "drawn by the seed"
@@ -26,6 +27,8 @@ class Origin:
     """Of what was simulated."""
     sensor: str
     """Name of the preset of the simulated camera's errors; empty for a real camera."""
+    camera: str = ""
+    """How the camera of a film was asked to move; empty where its seed drew that, and for what is no film."""
 
 
 def origin_of(recording: Path) -> Origin:
@@ -36,8 +39,11 @@ def origin_of(recording: Path) -> Origin:
     if not isinstance(made_with, Mapping):
         return Origin(scene_of(recording), None, "")
     seed, settings = made_with.get("seed"), made_with.get("settings")
-    sensor = _sensor_name(settings.get("sensor")) if isinstance(settings, Mapping) else ""
-    return Origin(scene_of(recording), seed if type(seed) is int else None, sensor)
+    sensor = camera = ""
+    if isinstance(settings, Mapping):
+        sensor, asked = _sensor_name(settings.get("sensor")), settings.get("camera")
+        camera = next((name for name in get_args(CameraMotion) if name == asked), "")
+    return Origin(scene_of(recording), seed if type(seed) is int else None, sensor, camera)
 
 
 def _sensor_name(sensor: Any) -> str:

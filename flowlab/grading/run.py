@@ -10,9 +10,11 @@ from flowlab.arguments import (
     check_count,
     check_names,
     check_optional_count,
+    check_optional_name,
     check_path,
     check_paths,
     check_settings,
+    check_size,
 )
 from flowlab.errors import UsageError, unknown_name
 from flowlab.files import told_when_unwritable, write_json
@@ -127,6 +129,8 @@ def grade(
         raise UsageError(
             "nothing to grade; give folders with a ground_truth.npz, --scenes tabletop,hands or --tasks hammer,push"
         )
+    sensor, camera = check_optional_name(sensor, "sensor"), check_optional_name(camera, "camera")
+    size = check_size(size, "size")
     if camera is not None and not scenes:
         raise UsageError(f"--camera {camera} is of films; give --scenes tabletop,hands, too")
     workers = check_optional_count(workers, "workers")

@@ -37,8 +37,14 @@ class EncoderSettings(Settings):
 
     @model_validator(mode="after")
     def _ordered(self) -> "EncoderSettings":
-        if self.subset_most is not None and (self.subset is None or self.subset_most < self.subset):
-            raise ValueError(f"subset_most is at least subset; found {self.subset_most} and {self.subset}")
+        if self.subset_most is None:
+            return self
+        if self.subset is None:
+            raise ValueError(f"subset_most={self.subset_most} needs the least number, as in subset=256; subset is null")
+        if not self.subset <= self.subset_most <= self.points:
+            raise ValueError(
+                f"subset_most is from subset ({self.subset}) to points ({self.points}); found {self.subset_most}"
+            )
         return self
 
 

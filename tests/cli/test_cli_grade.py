@@ -101,6 +101,27 @@ def test_a_report_says_what_was_graded_and_with_what(slides: Path, tmp_path: Pat
     assert mixed.graded == ("thin", "one")
     assert mixed.about[0] == "2 recordings (seed 1000)"
     assert mixed.about[2:4] == ("simulated sensor: tof", own)
+    carried = replace(film, origin=Origin("thin", 1000, "tof", "traveling"))
+    both = replace(report, trackers=(replace(tracker, rows=(film, carried)),))
+    assert both.graded == ("thin", "thin, traveling"), "one mean of both would be of neither"
+    assert list(both.trackers[0].by_scene()) == ["thin", "thin, traveling"]
+    assert [row["camera"] for row in both.to_json()["trackers"][0]["recordings"]] == ["", "traveling"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"camera": 3}, "camera: must be a name; found 3"),
+        ({"camera": ""}, "camera: must be a name; found ''"),
+        ({"sensor": True}, "sensor: must be a name; found True"),
+        ({"size": "320x240"}, "size: must be a width and a height, as in size=\\(320, 240\\); found '320x240'"),
+        ({"size": (3,)}, "size: must be a width and a height"),
+    ],
+)
+def test_arguments_of_a_wrong_kind(wrong: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=words):
+        grade_in_python(scenes="thin", out=tmp_path / "x", **wrong)
+    assert not (tmp_path / "x").exists()
 
 
 def test_json_is_all_that_is_printed(slides: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -382,8 +382,11 @@ def test_how_many_points_are_trained_on_may_be_random_too() -> None:
     assert (min(count), max(count)) == (5, 20)
     assert 80 < sum(n < 10 for n in count) < 120, "as often by halves as by doubles"
     assert make.build(windows).points.shape[1] == 20
-    with pytest.raises(UsageError, match="subset_most is at least subset; found 4 and 5"):
-        fdp("encoder.subset=5", "encoder.subset_most=4")
+    for most in (4, 21):
+        with pytest.raises(UsageError, match=rf"subset_most is from subset \(5\) to points \(20\); found {most}"):
+            fdp("encoder.points=20", "encoder.subset=5", f"encoder.subset_most={most}")
+    with pytest.raises(UsageError, match="subset_most=9 needs the least number"):
+        fdp("encoder.subset=null", "encoder.subset_most=9")
 
 
 def test_channels_are_never_a_subset_since_each_has_its_query() -> None:

@@ -26,6 +26,8 @@ def task(sensor: str) -> dict[str, Any]:
         ({"task": "hammer", "seed": 3, "settings": {"sensor": {"no": "such"}}}, Origin("hammer", 3, OTHER)),
         ({"scenes": "thin", "seed": 1000, "settings": {"sensor": "tof"}}, Origin("thin", 1000, "tof")),
         ({"scenes": "thin", "seed": 1000, "settings": {"sensor": None}}, Origin("thin", 1000, BY_SEED)),
+        ({"scenes": "thin", "seed": 7, "settings": {"camera": "traveling"}}, Origin("thin", 7, BY_SEED, "traveling")),
+        ({"scenes": "thin", "seed": 7, "settings": {"camera": "a" * 9999}}, Origin("thin", 7, BY_SEED)),
         ({"scenes": "thin", "seed": True, "settings": [1]}, Origin("thin", None, "")),
         ({"scenes": 5, "seed": "x", "settings": {"sensor": "x" * 9999}}, Origin("", None, OTHER)),
         (None, Origin("", None, "")),

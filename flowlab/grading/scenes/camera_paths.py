@@ -1,7 +1,7 @@
 """Where the camera of a procedural scene stands, and how a hand that holds it moves."""
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from flowlab.geometry.transforms import rigid
 
+CameraMotion = Literal["fixed", "hand-held", "hand-held, poses known", "traveling", "traveling, poses known"]
+"""What moves the camera of a film; those that travel are not drawn, but asked for."""
 CameraPath: TypeAlias = Callable[[Float[np.ndarray, "4 4"], int, np.random.Generator], Float[np.ndarray, "T 4 4"]]
 """Poses of a camera in so many frames, from its first."""
 

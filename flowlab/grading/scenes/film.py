@@ -3,7 +3,7 @@
 import json
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from flowlab.config import Settings
 from flowlab.errors import UsageError, unknown_name
 from flowlab.geometry.camera import Camera
 from flowlab.grading.graded_recording import QueryMix, made_once, write_graded
-from flowlab.grading.scenes.camera_paths import CameraPath, fixed_camera, hand_held, held_still, traveling
+from flowlab.grading.scenes.camera_paths import CameraMotion, CameraPath, fixed_camera, hand_held, held_still, traveling
 from flowlab.grading.scenes.families import FAMILIES, Family
 from flowlab.grading.scenes.world import CAMERA, body_name, build_world, poses_of
 from flowlab.perception.observer import Box, ObserverSettings
@@ -30,8 +30,6 @@ _DISTANCE_M = (0.5, 1.1)
 _EVERYTHING = Box(low=(-4.0, -4.0, -2.0), high=(4.0, 4.0, 4.0))
 
 
-CameraMotion = Literal["fixed", "hand-held", "hand-held, poses known", "traveling", "traveling, poses known"]
-"""What moves the camera of a film; those that travel are not drawn, but asked for."""
 _PATHS = {"fixed": held_still, "hand-held": hand_held, "traveling": traveling}
 
 
