@@ -20,9 +20,14 @@ class DiffusionPolicySettings(TrainSettings):
     diffusion: DiffusionSettings = DiffusionSettings()
 
     @property
+    def cloud_needs(self) -> CloudNeeds:
+        """What the encoder asks for."""
+        return CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most)
+
+    @property
     def needs(self) -> Needs:
         """Point clouds."""
-        return Needs(point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most))
+        return Needs(point_cloud=self.cloud_needs)
 
     @property
     def relative_to_gripper(self) -> bool:
@@ -97,9 +102,7 @@ class FDPSettings(DiffusionPolicySettings):
             scale=m.scale,
             clip=m.clip,
         )
-        return Needs(
-            point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most), flow=flow
-        )
+        return Needs(point_cloud=self.cloud_needs, flow=flow)
 
     @model_validator(mode="after")
     def _motion_fits(self) -> "FDPSettings":
@@ -124,9 +127,7 @@ class MBASettings(DiffusionPolicySettings):
     @property
     def needs(self) -> Needs:
         """Point clouds and, in training, the object's pose."""
-        return Needs(
-            point_cloud=CloudNeeds(self.encoder.points, self.encoder.subset, self.encoder.subset_most), object_pose=True
-        )
+        return Needs(point_cloud=self.cloud_needs, object_pose=True)
 
     @model_validator(mode="after")
     def _motion_fits(self) -> "MBASettings":

@@ -3,7 +3,6 @@
 import json
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from pydantic import Field
@@ -30,7 +29,14 @@ _DISTANCE_M = (0.5, 1.1)
 _EVERYTHING = Box(low=(-4.0, -4.0, -2.0), high=(4.0, 4.0, 4.0))
 
 
-_PATHS = {"fixed": held_still, "hand-held": hand_held, "traveling": traveling}
+_MOTIONS: dict[CameraMotion, tuple[CameraPath, bool]] = {
+    "fixed": (held_still, False),
+    "hand-held": (hand_held, False),
+    "hand-held, poses known": (hand_held, True),
+    "traveling": (traveling, False),
+    "traveling, poses known": (traveling, True),
+}
+"""The path of the camera, and whether the recording has its poses."""
 
 
 class FilmSettings(Settings):
@@ -49,10 +55,9 @@ class FilmSettings(Settings):
 
 
 def film_settings(sensor: str | None, size: tuple[int, int] | None, camera: str | None) -> FilmSettings:
-    """Settings with names that somebody typed; raises :class:`UsageError` where one does not exist."""
-    for kind, name, known in (("sensor", sensor, tuple(PRESETS)), ("camera", camera, get_args(CameraMotion))):
-        if name is not None and name not in known:
-            raise unknown_name(kind, name, known)
+    """Settings with a camera that somebody typed; raises :class:`UsageError` where there is none of that name."""
+    if camera is not None and camera not in _MOTIONS:
+        raise unknown_name("camera", camera, _MOTIONS)
     return FilmSettings.model_validate({"sensor": sensor, "size": size, "camera": camera})
 
 
@@ -95,10 +100,10 @@ def _film(family: Family, seed: int, settings: FilmSettings, into: Path) -> int:
     kinds: tuple[CameraMotion, ...] = ("fixed", "fixed", "hand-held", "hand-held, poses known")
     camera = settings.camera or kinds[rng.integers(len(kinds))]
     steps = settings.frames or int(rng.integers(40, 81))
-    motion, _, known = camera.partition(", ")
-    rollout = stage(family, seed, rng, size, steps, _PATHS[motion])
+    path, poses_known = _MOTIONS[camera]
+    rollout = stage(family, seed, rng, size, steps, path)
     observer = ObserverSettings(crop=_EVERYTHING, drop_background=False)
-    return write_graded(into, rollout, PRESETS[sensor], observer, settings.queries, poses_known=bool(known))
+    return write_graded(into, rollout, PRESETS[sensor], observer, settings.queries, poses_known=poses_known)
 
 
 def stage(

@@ -81,7 +81,7 @@ class NewPlaces:
     """Where a frame shows what did not stand there in the first, a grid of pixels."""
 
     xyz: Float64[np.ndarray, "n 3"]
-    """[m]."""
+    """[m], in the camera frame."""
     color: UInt8[np.ndarray, "n 3"]
     """Lightness, a and b."""
     around: UInt8[np.ndarray, "n 3"]
@@ -99,7 +99,7 @@ class NewPlaces:
         return cls(xyz[new], grid[new], cv2.blur(pictures.feature[t], _WINDOW)[v[new], u[new], 1:])
 
     def like(self, pictures: ClipFeatures, middle: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "k 3"]:
-        """Those of a color and about the depth of a point of the first frame."""
+        """Those [m] of a color and about the depth of a point [m] of the first frame."""
         height, width = pictures.depth.shape[1:]
         j, i = np.rint(pictures.project(middle)).astype(int).clip(0, [width - 1, height - 1])
         top, left = max(i - _WINDOW[0], 0), max(j - _WINDOW[0], 0)

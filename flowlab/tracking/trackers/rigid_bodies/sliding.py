@@ -39,8 +39,13 @@ class SlidingSurface:
     ) -> RigidMotion:
         """Steps of turns about a center and shifts: of each one step, two, and so on, each put back onto the surface.
 
+        Args:
+            turns: Axes of the turns [rad]; of these and the shifts only the ratio counts.
+            shifts: What goes with each [m].
+            center: What they turn about [m, camera frame].
+
         Returns:
-            As many motions of one frame as there are steps, as the frames of one.
+            K times ``STEPS`` motions of one frame, those of each slide together, as the frames of one.
         """
         speed = np.linalg.norm(np.cross(turns[:, None], self.xyz - center) + shifts[:, None], axis=-1).max(1)
         size = np.minimum(
