@@ -8,8 +8,11 @@ import numpy as np
 
 from flowlab.geometry.sampling import farthest_points
 from flowlab.records import Clip
+from flowlab.tracking.trackers.rigid_bodies.assignment import assign
+from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, segment_motion
+from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 FRAMES = 16
@@ -84,3 +87,12 @@ def scene(plates: list[moving_planes.Plate], noise: float = 0.0) -> Scene:
     """A scene of plates, filmed and made ready."""
     clip, owner = moving_planes.film(plates, noise=noise)
     return Scene(plates, clip, owner, extract_features(clip, 4.0))
+
+
+def fit_of(seen: Scene, *motions: RigidMotion) -> RigidBodyFit:
+    """Motions that are known, as a fit of a scene."""
+    grid = segment_motion(seen.pictures)
+    frames = len(seen.pictures)
+    nowhere = np.zeros((0, 2), np.int32)
+    bodies = tuple(RigidBody(nowhere, m, np.zeros(frames, bool)) for m in motions)
+    return RigidBodyFit(seen.pictures, grid, bodies, assign(seen.pictures, grid, motions))

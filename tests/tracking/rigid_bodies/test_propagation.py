@@ -2,27 +2,21 @@
 
 import numpy as np
 import pytest
-from rigid_body_scenes import FRAMES, Scene, scene, two_plates
+from rigid_body_scenes import FRAMES, Scene, fit_of, scene, two_plates
 
-from flowlab.tracking.trackers.rigid_bodies.assignment import assign
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
-from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
+from flowlab.tracking.trackers.rigid_bodies.choice import FollowedPoints
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
-def fit_of(seen: Scene, *motions: RigidMotion) -> RigidBodyFit:
-    grid = segment_motion(seen.pictures)
-    frames = len(seen.pictures)
-    nowhere = np.zeros((0, 2), np.int32)
-    bodies = tuple(RigidBody(nowhere, m, np.zeros(frames, bool)) for m in motions)
-    return RigidBodyFit(seen.pictures, grid, bodies, assign(seen.pictures, grid, motions))
-
-
 def carried(seen: Scene, uv: np.ndarray, *motions: RigidMotion) -> PropagatedTracks:
     z = seen.pictures.depth[0, uv[:, 1], uv[:, 0]].astype(float)
-    return propagate(fit_of(seen, *motions), uv.astype(float), z)
+    return propagate(fit_of(seen, *motions), uv.astype(float), z, not_followed(len(seen.pictures), len(uv)))
+
+
+def not_followed(frames: int, points: int) -> FollowedPoints:
+    return FollowedPoints(np.ones((frames, points, 3)), np.zeros((frames, points), bool))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +73,7 @@ def test_points_that_leave_the_picture_are_not_seen() -> None:
     cheap[0] = 9  # so that everything goes away
     fit = RigidBodyFit(fit.pictures, fit.grid, fit.bodies, type(fit.assignment)(cheap, cheap))
     z = seen.pictures.depth[0, uv[:, 1], uv[:, 0]].astype(float)
-    tracks = propagate(fit, uv.astype(float), z)
+    tracks = propagate(fit, uv.astype(float), z, not_followed(FRAMES, len(uv)))
     assert (tracks.motion == 1).all()
     assert tracks.visible[0].all()
     assert not tracks.visible[-8:].any()

@@ -7,13 +7,10 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.ndimage import convolve
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
-from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+from flowlab.tracking.trackers.rigid_bodies.choice import FollowedPoints, choose_motions
 from flowlab.tracking.trackers.rigid_bodies.proposals import flow
 
-_OWN_WEIGHT = 0.7
-"""Weight of a point's own cost against one cell's that looks exactly like it."""
 _REFINE_FRAMES, _REFINE_PRIOR = 4, 3.0
 """Frames to either side over which readings of the surface are averaged, and the weight of no shift among them."""
 _LEAST_TEXTURE, _FLOW_NOISE_PX = 2e-3, 0.1
@@ -40,28 +37,30 @@ class PropagatedTracks:
     """How badly color and depth fit at that very frame, 0 to 1; where the point is hidden, its cost."""
 
 
-def propagate(fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarray, "M"]) -> PropagatedTracks:
+def propagate(
+    fit: RigidBodyFit, uv: Float[np.ndarray, "M 2"], z: Float[np.ndarray, "M"], followed: FollowedPoints
+) -> PropagatedTracks:
     """Carry points of the first frame through the clip.
 
     Args:
         fit: The motions, and which pixels are whose.
         uv: The points' pixels in the pictures of the fit.
         z: Their depths there [m].
+        followed: The same points, followed in the pictures.
     """
     xyz = fit.pictures.unproject(uv.astype(float), z.astype(float))
-    cost = _smooth_costs(fit, uv, z, motion_costs(fit.pictures, fit.grid, fit.motions, uv, xyz))
-    motion = cost.argmin(0)
     every = np.stack([m.apply(xyz) for m in fit.motions])
-    path = every[motion, :, np.arange(len(uv))].swapaxes(0, 1)
-    path = _refine_depth(fit, path, (motion > 0) | fit.pictures.still_is_fitted)
+    choice = choose_motions(fit, uv, z, every, followed)
+    path = every[choice.motion, :, np.arange(len(uv))].swapaxes(0, 1)
+    path = _refine_depth(fit, path, (choice.motion > 0) | fit.pictures.still_is_fitted)
     seen = _surfaces.is_seen(fit.pictures.depth, fit.pictures.project(path), path[..., 2])
-    least = cost.min(0)
-    belief = np.exp(-(cost - least) / _COST_SCALE)
+    belief = np.exp(-(choice.against - choice.against.min(0)) / _COST_SCALE)
     belief /= belief.sum(0)
     spread = np.sqrt(np.einsum("bm,btm->tm", belief, ((every - path) ** 2).sum(-1)))
     return PropagatedTracks(
-        path, seen, motion, least, spread, _slip(fit, path, seen), _residual(fit, uv, path, seen, least)
-    )
+        path, seen, choice.motion, choice.cost, spread, _slip(fit, path, seen),
+        _residual(fit, uv, path, seen, choice.cost),
+    )  # fmt: skip
 
 
 def _refine_depth(fit: RigidBodyFit, path: np.ndarray, moving: np.ndarray) -> np.ndarray:
@@ -103,22 +102,3 @@ def _residual(fit: RigidBodyFit, uv: np.ndarray, path: np.ndarray, seen: np.ndar
     p = fit.pictures
     now = _costs.residuals(p.depth, p.feature, features, p.project(path), path[..., 2])
     return np.where(seen & (now >= 0), now, cost.clip(0, 1)).astype(np.float32)
-
-
-def _smooth_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """The points' own costs (B, M) averaged with those of the cells around that are as deep and colored alike."""
-    grid, height, width = fit.grid, *fit.grid.valid.shape
-    features = _costs.features_at(fit.pictures.feature[0], uv.astype(np.float32))[:, 1:]
-    cell_features = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
-    i, j = np.rint(uv[:, 1] / STEP).astype(int), np.rint(uv[:, 0] / STEP).astype(int)
-    total, weights = _OWN_WEIGHT * own, np.full(len(uv), _OWN_WEIGHT)
-    scale = np.array([_costs.L, _costs.A, _costs.B])
-    for y in range(-3, 4):
-        for x in range(-3, 4):
-            a, b = np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)
-            far = np.abs(grid.depth[a, b] - z) / (0.01 * np.maximum(1, z))
-            color = (np.abs(cell_features[a, b] - features) * scale).sum(1)
-            w = grid.valid[a, b] * np.exp(-np.minimum(far, 20) - color / 0.35 - (x * x + y * y) / 8)
-            total = total + w * fit.assignment.raw[:, a, b]
-            weights = weights + w
-    return (total / weights).astype(np.float32)

@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from pydantic import Field
 
-from flowlab.records import Clip, Tracks2D
+from flowlab.records import Clip, PositionSource, Tracks2D
 from flowlab.tracking.base import Tracker
 from flowlab.tracking.chunking import ChunkSettings, follow
 from flowlab.tracking.lifting import LiftSettings, lift
 from flowlab.tracking.trackers.lucas_kanade import LucasKanade
 from flowlab.tracking.trackers.rigid_bodies import doubt
 from flowlab.tracking.trackers.rigid_bodies._surfaces import is_seen
+from flowlab.tracking.trackers.rigid_bodies.choice import FollowedPoints
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
@@ -109,13 +110,20 @@ def fit_points(
     fit, uv = fit_bodies(pictures, options.seed), pictures.from_clip_pixels(xy[deep])
     if not fit.grid.valid.any():
         return None
-    carried = propagate(fit, uv, z[deep])
+    beside = _lifted(clip, followed, deep)
+    carried = propagate(fit, uv, z[deep], beside)
     xyz_cam = carried.xyz_cam
     seen = is_seen(clip.depth, pictures.to_clip_pixels(pictures.project(xyz_cam)), xyz_cam[..., 2])
-    followed_cam = clip.to_camera(lift(clip, followed, LiftSettings()).xyz_world[:, deep].astype(np.float64))
     unseen = slippage(fit, pictures.unproject(uv.astype(np.float64), z[deep].astype(np.float64)))
-    against = doubt.evidence(fit, carried, uv, z[deep], seen, followed_cam, unseen)
+    against = doubt.evidence(fit, carried, uv, z[deep], seen, beside.xyz_cam, unseen)
     return FittedPoints(pictures, deep, carried, seen, against)
+
+
+def _lifted(clip: Clip, followed: Tracks2D, points: np.ndarray) -> FollowedPoints:
+    """Some of the points that were followed, in the camera frame."""
+    lifted = lift(clip, followed, LiftSettings())
+    xyz_cam = clip.to_camera(lifted.xyz_world[:, points].astype(np.float64))
+    return FollowedPoints(xyz_cam, (lifted.visible & (lifted.source == PositionSource.MEASURED))[:, points])
 
 
 def combined(clip: Clip, followed: Tracks2D, fitted: FittedPoints | None, unexplained: float) -> Tracks2D:

@@ -1,0 +1,113 @@
+"""Which motion carries a query point: told by the pictures, by where the point was followed in them, and by what is
+around it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from scipy.spatial import cKDTree
+
+from flowlab.tracking.trackers.rigid_bodies import _costs
+from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
+from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+
+_OWN_WEIGHT = 0.7
+"""Weight of a point's own cost against one cell's that looks exactly like it."""
+_ELSEWHERE, _ELSEWHERE_M, _LEAST_FOLLOWED = 0.4, 0.06, 3
+"""What it costs a motion to carry a point elsewhere than where it was followed, how far off [m, at up to 1 m] is wholly
+elsewhere, and in how many frames it must have been followed to tell."""
+_FOREIGN, _EXPLAINED, _NOT_EXPLAINED = 0.4, 0.6, 0.85
+"""What it costs that nothing around a point moves so, where no motion explains the point: from this cost on, and wholly
+from that. It is what is hidden nearly always that costs so much."""
+_REACH_M, _CELL_COST = 0.03, 0.3
+"""How far around a point [m] that is looked at, and the cost by which a cell says less of it, a factor e each."""
+
+
+@dataclass(frozen=True, slots=True)
+class FollowedPoints:
+    """Points as a tracker that knows nothing of bodies follows them in the pictures."""
+
+    xyz_cam: Float64[np.ndarray, "T M 3"]
+    """[m]; filled where not measured."""
+    measured: Bool[np.ndarray, "T M"]
+    """Whether it sees them, and depth is read there."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionChoice:
+    """The motions of M points."""
+
+    motion: Int64[np.ndarray, "M"]
+    cost: Float32[np.ndarray, "M"]
+    """How badly it explains the point by the pictures; 0 is perfect, 1 is nothing like it."""
+    against: Float32[np.ndarray, "B M"]
+    """All that speaks against each motion."""
+
+
+def choose_motions(
+    fit: RigidBodyFit,
+    uv: Float[np.ndarray, "M 2"],
+    z: Float[np.ndarray, "M"],
+    paths: Float64[np.ndarray, "B T M 3"],
+    followed: FollowedPoints,
+) -> MotionChoice:
+    """The motion of every point against which least speaks.
+
+    Args:
+        fit: The motions, and which pixels are whose.
+        uv: The points' pixels in the first of its pictures.
+        z: Their depths there [m].
+        paths: Where each motion takes them [m].
+        followed: Where another tracker does.
+    """
+    cost = _picture_costs(fit, uv, z, motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0]))
+    against = cost + _ELSEWHERE * _elsewhere(paths, followed)
+    unexplained = ((against.min(0) - _EXPLAINED) / (_NOT_EXPLAINED - _EXPLAINED)).clip(0, 1)
+    doubtful = np.flatnonzero(unexplained)
+    against[:, doubtful] += _FOREIGN * unexplained[doubtful] * (1 - _taken_around(fit, paths[0, 0, doubtful]))
+    motion = against.argmin(0)
+    return MotionChoice(motion, cost[motion, np.arange(len(uv))], against.astype(np.float32))
+
+
+def _picture_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> Float32[np.ndarray, "B M"]:
+    """The points' own costs (B, M) averaged with those of the cells around that are as deep and colored alike."""
+    grid, height, width = fit.grid, *fit.grid.valid.shape
+    features = _costs.features_at(fit.pictures.feature[0], uv.astype(np.float32))[:, 1:]
+    cell_features = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
+    i, j = np.rint(uv[:, 1] / STEP).astype(int), np.rint(uv[:, 0] / STEP).astype(int)
+    total, weights = _OWN_WEIGHT * own, np.full(len(uv), _OWN_WEIGHT)
+    scale = np.array([_costs.L, _costs.A, _costs.B])
+    for y in range(-3, 4):
+        for x in range(-3, 4):
+            a, b = np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)
+            far = np.abs(grid.depth[a, b] - z) / (0.01 * np.maximum(1, z))
+            color = (np.abs(cell_features[a, b] - features) * scale).sum(1)
+            w = grid.valid[a, b] * np.exp(-np.minimum(far, 20) - color / 0.35 - (x * x + y * y) / 8)
+            total = total + w * fit.assignment.raw[:, a, b]
+            weights = weights + w
+    return (total / weights).astype(np.float32)
+
+
+def _elsewhere(paths: Float64[np.ndarray, "B T M 3"], followed: FollowedPoints) -> Float64[np.ndarray, "B M"]:
+    """How far from where a point was followed each motion takes it, 0 to 1, in the mean over the frames that tell."""
+    tells = followed.measured.copy()
+    tells[0] = False
+    tells &= tells.sum(0) >= _LEAST_FOLLOWED
+    limit = _ELSEWHERE_M * np.maximum(1, followed.xyz_cam[..., 2])
+    off = [np.minimum(np.linalg.norm(path - followed.xyz_cam, axis=-1) / limit, 1) for path in paths]
+    return np.stack([(o * tells).sum(0) / np.maximum(tells.sum(0), 1) for o in off])
+
+
+def _taken_around(fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "B m"]:
+    """The share of what is around points of the first frame that takes each motion, what it explains best most."""
+    cells = fit.grid.valid
+    cost, owner = fit.assignment.cost[:, cells], fit.assignment.best_motion[cells]
+    at = fit.pictures.unproject(fit.grid.pixels(cells).astype(float), fit.grid.depth[cells].astype(float))
+    says = np.exp(-cost.min(0) / _CELL_COST)
+    share = np.full((len(cost), len(xyz_cam)), 1 / len(cost))
+    for k, near in enumerate(cKDTree(at).query_ball_point(xyz_cam, 3 * _REACH_M)):
+        if near:
+            weight = says[near] * np.exp(-np.linalg.norm(at[near] - xyz_cam[k], axis=1) / _REACH_M)
+            share[:, k] = np.bincount(owner[near], weight, len(cost)) / weight.sum()
+    return share
