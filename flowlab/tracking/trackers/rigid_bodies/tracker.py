@@ -14,7 +14,7 @@ from flowlab.tracking.lifting import LiftSettings, lift
 from flowlab.tracking.trackers.lucas_kanade import LucasKanade
 from flowlab.tracking.trackers.rigid_bodies import doubt
 from flowlab.tracking.trackers.rigid_bodies._surfaces import is_seen
-from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features, large_enough
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
 from flowlab.tracking.trackers.rigid_bodies.slippage import slippage
@@ -93,7 +93,8 @@ class FittedPoints:
 def fit_points(
     clip: Clip, xy: Float[np.ndarray, "N 2"], followed: Tracks2D, options: RigidBodies
 ) -> FittedPoints | None:
-    """Fit bodies to a clip, and carry points of its first frame; None where it is too short, or has too little depth.
+    """Fit bodies to a clip, and carry points of its first frame; None where it is too short or small, or has too little
+    depth.
 
     Args:
         clip: The pictures.
@@ -103,7 +104,7 @@ def fit_points(
     """
     z = depth_at(clip.depth[0], xy)
     deep = np.flatnonzero((z > 0) & (z < options.max_depth))
-    if len(clip) < _MIN_FRAMES or len(deep) == 0:
+    if len(clip) < _MIN_FRAMES or len(deep) == 0 or not large_enough(clip):
         return None
     pictures = extract_features(clip, options.max_depth)
     fit, uv = fit_bodies(pictures, options.seed), pictures.from_clip_pixels(xy[deep])
