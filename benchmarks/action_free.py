@@ -1,7 +1,7 @@
 """What demonstrations without actions are worth: few labeled ones, and films whose actions are inferred.
 
     python benchmarks/action_free.py --out OUT                             # errors of inferred numbers: no training
-    python benchmarks/action_free.py --out OUT --policies dp3 fdp --ways labeled clouds exact lucas-kanade all
+    python benchmarks/action_free.py --out OUT --policies dp3 fdp --ways labeled clouds state exact lucas-kanade all
     python benchmarks/action_free.py --out OUT --print                     # tables of what is there
 
 For every task, K demonstrations with actions and films without state and actions are extracted. The films are labeled
@@ -31,8 +31,15 @@ from flowlab.files import write_json
 TASKS = (
     "push", "basketball", "pick-place", "box-close", "peg-insert-side", "shelf-place", "sweep-into", "hammer",
 )  # fmt: skip
-SOURCES = {"clouds": ("films", ("tracks=false",)), "exact": ("films", ()), "lucas-kanade": ("pictures", ())}
-"""Of the gripper's path: the dataset of films, and settings of ``label-actions``."""
+SOURCES = {
+    "clouds": ("films", ("tracks=false",)),
+    "state": ("states", ()),
+    "exact": ("films", ()),
+    "lucas-kanade": ("pictures", ()),
+}
+"""Of the gripper's path: the dataset of films, and settings of ``label-actions``. Films of ``state`` have theirs."""
+WITHHELD = {"truth": (), "states": ("actions",), "films": ("actions", "state"), "pictures": ("actions", "state")}
+"""What each dataset of films is without."""
 WAYS = ("labeled", *SOURCES, "all")
 """What a policy learns from: K demonstrations alone; these and films that were labeled from a source; these and the
 same films with the actions that were withheld."""
@@ -62,11 +69,10 @@ class Bench:
         return self.data(task, f"labeled-{count}", episodes=count)
 
     def some_films(self, task: str, name: str) -> flowlab.Dataset:
-        """Films of a task: with all that is known (``truth``), without (``films``), or with tracks that were estimated
-        from a depth camera's pictures (``pictures``)."""
+        """Films of a task, some of it withheld; tracks of ``pictures`` were estimated from a depth camera's."""
         about: dict[str, Any] = {"episodes": self.films, "settings": [f"first_seed={FIRST_FILM}"]}
-        if name != "truth":
-            about["without"] = ("actions", "state")
+        if WITHHELD[name]:
+            about["without"] = WITHHELD[name]
         return self.data(
             task, f"{name}-{self.films}", recipe=str(RECIPE) if name == "pictures" else "metaworld", **about
         )
@@ -100,7 +106,8 @@ class Bench:
         """How far off labels are, against what was withheld."""
 
         def make() -> dict[str, Any]:
-            return compare(self.inferred(task, count, source), self.some_films(task, "truth"), state=True)
+            state = "state" in WITHHELD[SOURCES[source][0]]
+            return compare(self.inferred(task, count, source), self.some_films(task, "truth"), state=state)
 
         about = {"task": task, "labeled": count, "source": source, "films": self.films}
         return self.unit(f"labels-{task}-{count}-{source}-{self.films}", make, about)
@@ -160,6 +167,7 @@ def main() -> None:
     units = [json.loads(path.read_text()) for path in sorted((args.out / "units").glob("*.json"))]
     _print_labels([u for u in units if "source" in u])
     _print_policies([u for u in units if "way" in u])
+    _print_gaps([u for u in units if "way" in u])
 
 
 def _print_labels(units: list[dict[str, Any]]) -> None:
@@ -168,8 +176,9 @@ def _print_labels(units: list[dict[str, Any]]) -> None:
     for u in units:
         cells = [u["task"], u["labeled"], u["source"], f"{u['kept']} of {u['of']}"]
         if u["kept"]:
-            cells += [f"{u['action_l1']:.3f}", _mean(u["action_within_sigma"]), _mean(u["state_median_mm"][:3])]
-            cells += [u["motion_median_mm"], _mean(u["state_within_sigma"])]
+            cells += [f"{u['action_l1']:.3f}", _mean(u["action_within_sigma"])]
+            if "state_median_mm" in u:
+                cells += [_mean(u["state_median_mm"][:3]), u["motion_median_mm"], _mean(u["state_within_sigma"])]
         print("|", " | ".join(map(str, cells)), "|")
 
 
@@ -190,6 +199,26 @@ def _print_policies(units: list[dict[str, Any]]) -> None:
             p = f"{binomtest(won, won + lost).pvalue:.3g}" if won + lost else "1"
         row = (*_key(u), u["way"], u["trained_on"], f"{u['sum']} of {u['of']}", p)
         print("|", " | ".join(map(str, row)), "|")
+
+
+def _print_gaps(units: list[dict[str, Any]]) -> None:
+    """How much of what actions of the films would add their labels do, in the mean over tasks and training seeds, and
+    McNemar's test over all layouts against the labeled demonstrations alone."""
+    known = {(*_key(u), u["way"]): u for u in units}
+    print("| K | policy | learned from | runs | alone | so | with their actions | gap closed | p, against alone |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for count, policy, way in sorted({(u["labeled"], u["policy"], u["way"]) for u in units if u["way"] in SOURCES}):
+        keys = [k[:4] for k in known if k[1:3] == (count, policy) and k[4] == way]
+        three = [[known.get((*k, w)) for w in ("labeled", way, "all")] for k in keys]
+        whole = [[np.array(u["solved"]) for u in row if u] for row in three if all(row)]
+        if whole:
+            alone, so, most = (np.concatenate(column) for column in zip(*whole, strict=True))
+            won, lost = int((so > alone).sum()), int((so < alone).sum())
+            between = most.mean() - alone.mean()
+            gap = f"{(so.mean() - alone.mean()) / between:.0%}" if between else ""
+            p = f"{binomtest(won, won + lost).pvalue:.3g}" if won + lost else "1"
+            means = [f"{x.mean():.1%}" for x in (alone, so, most)]
+            print("|", " | ".join([str(count), policy, way, str(len(whole)), *means, gap, p]), "|")
 
 
 def _key(unit: dict[str, Any]) -> tuple[Any, ...]:

@@ -12,12 +12,12 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 
 def choice(
-    seen: Scene, uv: np.ndarray, motions: list[RigidMotion], followed: np.ndarray, measured: np.ndarray | bool = True
+    seen: Scene, uv: np.ndarray, motions: list[RigidMotion], followed: np.ndarray, believed: np.ndarray | bool = True
 ) -> MotionChoice:
     fit, xyz = fit_of(seen, *motions), seen.points(uv)
     z = seen.pictures.depth[0, uv[:, 1], uv[:, 0]].astype(float)
     paths = np.stack([m.apply(xyz) for m in fit.motions])
-    return choose_motions(fit, uv, z, paths, FollowedPoints(followed, np.broadcast_to(measured, followed.shape[:2])))
+    return choose_motions(fit, uv, z, paths, FollowedPoints(followed, np.broadcast_to(believed, followed.shape[:2])))
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_point_that_nothing_explains_goes_with_what_is_around_it() -> None:
     back = np.where(np.arange(FRAMES) > 0, 0.15, 0)[:, None] * [0, 0, 1.0]
     unseen = RigidMotion(true.R, true.t + back)
     still = np.broadcast_to(seen.points(uv), (FRAMES, len(uv), 3))
-    found = choice(seen, uv, [true, unseen], still.copy(), measured=False)
+    found = choice(seen, uv, [true, unseen], still.copy(), believed=False)
     assert (found.cost > 0.6).all()
     assert (found.motion == 1).all()
 
@@ -77,5 +77,5 @@ def test_what_a_motion_explains_stays_with_it_whatever_is_around() -> None:
     seen = two_plates()
     uv = seen.some_pixels(1, 60, border=2)
     path = seen.motion(1).apply(seen.points(uv))
-    found = choice(seen, uv, [seen.motion(1), seen.motion(2)], path, measured=False)
+    found = choice(seen, uv, [seen.motion(1), seen.motion(2)], path, believed=False)
     assert (found.motion == 1).mean() > 0.95

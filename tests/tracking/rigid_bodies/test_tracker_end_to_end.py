@@ -178,3 +178,15 @@ def test_hardly_any_depth_is_no_reason_to_stop(pixels: list[tuple[int, int]]) ->
         replace(clip, depth=depth), np.array(pixels, np.float32), RigidBodies(), ChunkSettings(), LiftSettings()
     )
     np.testing.assert_allclose(labels.xyz_world[-1], labels.xyz_world[0], atol=0.01)
+
+
+@pytest.mark.parametrize(("width", "height"), [(8, 8), (40, 12), (640, 20)])
+def test_pictures_that_are_too_small_for_optical_flow_are_followed_without(width: int, height: int) -> None:
+    """OpenCV would end the process at such pictures, or raise an error of its own."""
+    clip, _ = moving_planes.film([moving_planes.wall(1.2, 5)], width=width, height=height)
+    tracks, labels = label_clip(
+        clip, np.array([[width // 2, height // 2]], np.float32), RigidBodies(), ChunkSettings(), LiftSettings()
+    )
+    assert np.isfinite(tracks.xy).all()
+    assert labels.quality is not None
+    assert not (labels.quality.source == PositionSource.MODEL).any()

@@ -17,7 +17,7 @@ _OWN_WEIGHT = 0.7
 _ELSEWHERE, _ELSEWHERE_M, _LEAST_FOLLOWED = 0.4, 0.06, 3
 """What it costs a motion to carry a point elsewhere than where it was followed, how far off [m, at up to 1 m] is wholly
 elsewhere, and in how many frames it must have been followed to tell."""
-_FOREIGN, _EXPLAINED, _NOT_EXPLAINED = 0.4, 0.6, 0.85
+_FOREIGN, _EXPLAINED, _NOT_EXPLAINED = 0.3, 0.6, 0.85
 """What it costs that nothing around a point moves so, where no motion explains the point: from this cost on, and wholly
 from that. It is what is hidden nearly always that costs so much."""
 _REACH_M, _CELL_COST = 0.03, 0.3
@@ -30,8 +30,8 @@ class FollowedPoints:
 
     xyz_cam: Float64[np.ndarray, "T M 3"]
     """[m]; filled where not measured."""
-    measured: Bool[np.ndarray, "T M"]
-    """Whether it sees them, and depth is read there."""
+    believed: Bool[np.ndarray, "T M"]
+    """Whether it sees them, looking as they did, and depth is read there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ def _picture_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.nda
 
 def _elsewhere(paths: Float64[np.ndarray, "B T M 3"], followed: FollowedPoints) -> Float64[np.ndarray, "B M"]:
     """How far from where a point was followed each motion takes it, 0 to 1, in the mean over the frames that tell."""
-    tells = followed.measured.copy()
+    tells = followed.believed.copy()
     tells[0] = False
     tells &= tells.sum(0) >= _LEAST_FOLLOWED
     limit = _ELSEWHERE_M * np.maximum(1, followed.xyz_cam[..., 2])

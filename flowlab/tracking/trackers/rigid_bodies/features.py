@@ -14,6 +14,8 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 WIDTH = 320
 """Pictures are shrunk by a whole factor to about this width [px]: the fit gains nothing from more."""
+_MIN_SIDE = 16
+"""Optical flow needs so many rows and columns."""
 _BLUR = 0.8
 _LCN_WINDOW, _LCN_FLOOR, _LCN_LIMIT = 9, 6.0, 1.5
 
@@ -87,7 +89,7 @@ def extract_features(clip: Clip, max_depth: float) -> ClipFeatures:
         clip: The pictures; they are shrunk by a whole factor where they are much wider than ``WIDTH``.
         max_depth: Depth beyond this [m] counts as missing.
     """
-    factor = max(1, round(clip.camera.width / WIDTH))
+    factor = _factor(clip)
     offset = (factor - 1) // 2
     K = clip.camera.K.astype(float).copy()
     K[:2, 2] -= offset
@@ -110,6 +112,16 @@ def extract_features(clip: Clip, max_depth: float) -> ClipFeatures:
         T_cam_first = inverse(clip.T_world_cam) @ clip.T_world_cam[0]
         still = RigidMotion(T_cam_first[:, :3, :3].copy(), T_cam_first[:, :3, 3].copy())
     return ClipFeatures(K, factor, offset, depth, smooth, normal, feature, flow, still)
+
+
+def large_enough(clip: Clip) -> bool:
+    """Whether there is optical flow between its pictures: OpenCV ends the process at some that have few rows."""
+    return min(clip.depth.shape[1:]) // _factor(clip) >= _MIN_SIDE
+
+
+def _factor(clip: Clip) -> int:
+    """By how much its pictures are shrunk."""
+    return max(1, round(clip.camera.width / WIDTH))
 
 
 def _feature(rgb: np.ndarray, factor: int, offset: int) -> np.ndarray:

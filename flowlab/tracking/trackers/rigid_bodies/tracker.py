@@ -15,11 +15,14 @@ from flowlab.tracking.trackers.lucas_kanade import LucasKanade
 from flowlab.tracking.trackers.rigid_bodies import doubt
 from flowlab.tracking.trackers.rigid_bodies._surfaces import is_seen
 from flowlab.tracking.trackers.rigid_bodies.choice import FollowedPoints
-from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
+from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features, large_enough
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
 from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks, propagate
 from flowlab.tracking.trackers.rigid_bodies.slippage import slippage
 
+_BELIEVED = 0.6
+"""Confidence of a point that was followed above which it tells which motion carries it: along an edge or before another
+surface it is lost at less."""
 _MIN_FRAMES = 3
 """A shorter clip shows no motion to fit."""
 
@@ -94,7 +97,8 @@ class FittedPoints:
 def fit_points(
     clip: Clip, xy: Float[np.ndarray, "N 2"], followed: Tracks2D, options: RigidBodies
 ) -> FittedPoints | None:
-    """Fit bodies to a clip, and carry points of its first frame; None where it is too short, or has too little depth.
+    """Fit bodies to a clip, and carry points of its first frame; None where it is too short or small, or has too little
+    depth.
 
     Args:
         clip: The pictures.
@@ -104,7 +108,7 @@ def fit_points(
     """
     z = depth_at(clip.depth[0], xy)
     deep = np.flatnonzero((z > 0) & (z < options.max_depth))
-    if len(clip) < _MIN_FRAMES or len(deep) == 0:
+    if len(clip) < _MIN_FRAMES or len(deep) == 0 or not large_enough(clip):
         return None
     pictures = extract_features(clip, options.max_depth)
     fit, uv = fit_bodies(pictures, options.seed), pictures.from_clip_pixels(xy[deep])
@@ -123,7 +127,9 @@ def _lifted(clip: Clip, followed: Tracks2D, points: np.ndarray) -> FollowedPoint
     """Some of the points that were followed, in the camera frame."""
     lifted = lift(clip, followed, LiftSettings())
     xyz_cam = clip.to_camera(lifted.xyz_world[:, points].astype(np.float64))
-    return FollowedPoints(xyz_cam, (lifted.visible & (lifted.source == PositionSource.MEASURED))[:, points])
+    alike = followed.visible & (followed.confidence > _BELIEVED)
+    believed = alike & lifted.visible & (lifted.source == PositionSource.MEASURED)
+    return FollowedPoints(xyz_cam, believed[:, points])
 
 
 def combined(clip: Clip, followed: Tracks2D, fitted: FittedPoints | None, unexplained: float) -> Tracks2D:
