@@ -17,9 +17,14 @@ _OWN_WEIGHT = 0.7
 _ELSEWHERE, _ELSEWHERE_M, _LEAST_FOLLOWED = 0.4, 0.06, 3
 """What it costs a motion to carry a point elsewhere than where it was followed, how far off [m, at up to 1 m] is wholly
 elsewhere, and in how many frames it must have been followed to tell."""
-_FOREIGN, _EXPLAINED, _NOT_EXPLAINED = 0.3, 0.6, 0.85
-"""What it costs that nothing around a point moves so, where no motion explains the point: from this cost on, and wholly
-from that. It is what is hidden nearly always that costs so much."""
+_BADLY_SHOWN = (0.5, 0.75)
+"""Where the pictures explain a point at less than the first, they alone tell its motion, for beside what moves its
+edge is followed; from the second on, where it was followed counts wholly."""
+_FOREIGN = 0.3
+"""What it costs that nothing around a point moves so."""
+_UNEXPLAINED = (0.6, 0.85)
+"""From this cost on no motion explains a point, and wholly from that: it is what is hidden nearly always that costs so
+much, and then what is around it counts."""
 _REACH_M, _CELL_COST = 0.03, 0.3
 """How far around a point [m] that is looked at, and the cost by which a cell says less of it, a factor e each."""
 
@@ -62,12 +67,17 @@ def choose_motions(
         followed: Where another tracker does.
     """
     cost = _picture_costs(fit, uv, z, motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0]))
-    against = cost + _ELSEWHERE * _elsewhere(paths, followed)
-    unexplained = ((against.min(0) - _EXPLAINED) / (_NOT_EXPLAINED - _EXPLAINED)).clip(0, 1)
+    against = cost + _ELSEWHERE * _ramp(cost.min(0), *_BADLY_SHOWN) * _elsewhere(paths, followed)
+    unexplained = _ramp(against.min(0), *_UNEXPLAINED)
     doubtful = np.flatnonzero(unexplained)
     against[:, doubtful] += _FOREIGN * unexplained[doubtful] * (1 - _taken_around(fit, paths[0, 0, doubtful]))
     motion = against.argmin(0)
     return MotionChoice(motion, cost[motion, np.arange(len(uv))], against.astype(np.float32))
+
+
+def _ramp(cost: np.ndarray, low: float, high: float) -> np.ndarray:
+    """0 up to a cost, 1 from another on."""
+    return ((cost - low) / (high - low)).clip(0, 1)
 
 
 def _picture_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> Float32[np.ndarray, "B M"]:
@@ -106,8 +116,10 @@ def _taken_around(fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "m 3"]) -> Flo
     at = fit.pictures.unproject(fit.grid.pixels(cells).astype(float), fit.grid.depth[cells].astype(float))
     says = np.exp(-cost.min(0) / _CELL_COST)
     share = np.full((len(cost), len(xyz_cam)), 1 / len(cost))
-    for k, near in enumerate(cKDTree(at).query_ball_point(xyz_cam, 3 * _REACH_M)):
+    tree = cKDTree(at)
+    for k, point in enumerate(xyz_cam):  # one by one: of thousands of points near the camera, all lists take gigabytes
+        near = tree.query_ball_point(point, 3 * _REACH_M)
         if near:
-            weight = says[near] * np.exp(-np.linalg.norm(at[near] - xyz_cam[k], axis=1) / _REACH_M)
+            weight = says[near] * np.exp(-np.linalg.norm(at[near] - point, axis=1) / _REACH_M)
             share[:, k] = np.bincount(owner[near], weight, len(cost)) / weight.sum()
     return share

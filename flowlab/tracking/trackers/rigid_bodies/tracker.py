@@ -21,8 +21,7 @@ from flowlab.tracking.trackers.rigid_bodies.propagation import PropagatedTracks,
 from flowlab.tracking.trackers.rigid_bodies.slippage import slippage
 
 _BELIEVED = 0.6
-"""Confidence of a point that was followed above which it tells which motion carries it: along an edge or before another
-surface it is lost at less."""
+"""Confidence above which where a point was followed helps to tell its motion: what is thin is led astray at less."""
 _MIN_FRAMES = 3
 """A shorter clip shows no motion to fit."""
 
