@@ -187,7 +187,7 @@ def test_what_is_too_poor_is_rejected_and_can_be_looked_at(recordings: Path, tmp
         ("quality", k, str(recordings / name)) for k, name in enumerate(("take 1", "take 2", "take 10"))
     ]
     assert (
-        "with a stated error below 0.001 mm, at least 20% asked for (quality.min_sure_share)" in poor.rejects[0].reason
+        "with a stated error below 0.001 mm, at least 25% asked for (quality.min_sure_share)" in poor.rejects[0].reason
     )
     shown = poor.rejected(2)
     assert (shown.seed, shown.rgb, shown.extras["tracker"]["tracker"]) == (2, None, "lucas-kanade")

@@ -13,7 +13,7 @@ class QualityStage(Stage):
     stage: str = "quality"
     sure_m: float = Field(default=0.05, gt=0)
     """A position counts as sure if the camera sees the point and its stated error is below this [m]."""
-    min_sure_share: float = Field(default=0.2, ge=0, le=1)
+    min_sure_share: float = Field(default=0.25, ge=0, le=1)
     """Share of all positions, over points and frames, that must be sure."""
     max_median_sigma_m: float = Field(default=0.05, gt=0)
     """Median stated error of visible points [m] that is still good enough: labels of which half may be farther off are
