@@ -74,7 +74,7 @@ def test_what_the_pictures_explain_does_not_go_where_it_was_followed() -> None:
     apart, along = (choice(seen, uv, motions, m.apply(seen.points(uv))) for m in motions)
     explained = apart.cost < 0.5
     assert explained.mean() > 0.9
-    np.testing.assert_array_equal(apart.motion[explained], along.motion[explained])
+    np.testing.assert_array_equal(apart.against[:, explained], along.against[:, explained])
 
 
 def test_what_a_motion_explains_stays_with_it_whatever_is_around() -> None:

@@ -63,7 +63,7 @@ def choose_motions(
         fit: The motions, and which pixels are whose.
         uv: The points' pixels in the first of its pictures.
         z: Their depths there [m].
-        paths: Where each motion takes them [m].
+        paths: Where each motion takes them [m], in the camera frame; of the first frame, where they are.
         followed: Where another tracker does.
     """
     cost = _picture_costs(fit, uv, z, motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0]))
