@@ -250,6 +250,33 @@ def test_poses_that_are_not_the_cameras_are_refused(
     assert code == (3 if verdict == "refused" else 0), problem
 
 
+def lost(first: int, last: int) -> np.ndarray:
+    """Poses of a camera whose tracking stood still for a while."""
+    T = POSES.copy()
+    T[first:last] = T[first]
+    return T
+
+
+@pytest.mark.parametrize(("T", "verdict"), [(lost(3, 11), "refused"), (lost(4, 8), "doubtful"), (POSES, "ok")])
+def test_poses_that_are_wrong_for_a_while_are_found(
+    frames: Frames, tmp_path: Path, capsys: Capture, T: np.ndarray, verdict: str
+) -> None:
+    code, found, problem, _ = looked_at(capsys, put(tmp_path / "r", frames, T))
+    assert (code, found["camera"][0]) == (3 if verdict == "refused" else 0, verdict), found["camera"]
+    if verdict != "ok":
+        assert re.search(r"not between \d of them, by .* mm from .*0\d\d\d.png to", found["camera"][1]), problem
+
+
+def test_true_poses_are_not_refused_for_a_hand_that_fills_the_picture(tmp_path: Path, capsys: Capture) -> None:
+    scene, shots = (TABLE, WALL, FLOOR, *THINGS), []
+    for k, T in enumerate(POSES):
+        near = T[:3, 3] + 0.3 * T[:3, 2] + (0.02 * k - 0.14) * T[:3, 0]
+        hand = [Box(tuple(near), (0.5, 0.5, 0.05), (200, 150, 130))] if 6 <= k <= 8 else []
+        shots.append(film((*scene, *hand), K, SIZE, T, seed=k))
+    code, found, problem, _ = looked_at(capsys, put(tmp_path / "r", shots, POSES))
+    assert (code, found["camera"][0]) in ((0, "ok"), (0, "doubtful")), problem
+
+
 def moved(rows: slice | list[int], by: float) -> np.ndarray:
     T = POSES.copy()
     T[rows, 0, 3] += by
