@@ -8,10 +8,6 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, Num
 
-from flowlab.recordings.base import ImageStream, Streams
-from flowlab.recordings.motion import Motion, check_motion
-from flowlab.recordings.verdicts import Check
-
 _TILES = 8
 """A picture is looked at in so many rows and columns of tiles."""
 _NOISY = (0.3, 0.7)
@@ -47,42 +43,6 @@ def digest(picture: np.ndarray) -> PictureDigest:
     sums = [zlib.crc32(tile) for tile in tiles]
     plain = tuple(0 if tile == tile[:pixel] * (len(tile) // pixel) else n for tile, n in zip(tiles, sums, strict=True))
     return PictureDigest(zlib.crc32(np.array(sums, np.uint32).tobytes()), plain, small)
-
-
-def motion_of(name: str, stream: ImageStream, digests: Mapping[int, PictureDigest]) -> Motion:
-    """When the pictures of a stream change, of those that were looked at."""
-    kept = sorted(digests)
-    change = np.array([change_between(digests[a], digests[b]) for a, b in pairwise(kept)], np.float64)
-    return Motion.make(name, stream.time_s[kept], change)
-
-
-def motion_checks(
-    streams: Streams,
-    color: Mapping[int, PictureDigest],
-    depth: Mapping[int, PictureDigest],
-    stated: Mapping[str, float],
-) -> tuple[Check, ...]:
-    """Whether depth and the robot move when the color pictures change.
-
-    Args:
-        streams: The recording.
-        color: What is kept of color pictures, by index.
-        depth: Likewise of depth pictures.
-        stated: What the user has added to the times of a stream [s]: of depth, of state.
-    """
-    if len(color) < 2 or len(depth) < 2:
-        return ()
-    pictures = motion_of("color", streams.color, color)
-    found = [check_motion(pictures, motion_of("depth", streams.depth, depth), stated.get("depth"))]
-    for s in streams.state[:1]:
-        if len(s.time_s) > 1 and s.values.shape[1]:
-            reach = np.maximum(np.ptp(s.values, axis=0), 1e-9)
-            change = np.linalg.norm(np.diff(s.values, axis=0) / reach, axis=1).astype(np.float64)
-            found.append(check_motion(pictures, Motion.make("the robot", s.time_s, change), stated.get("state")))
-    return tuple(found)
-
-
-# --- whether pictures are the same --------------------------------------------------------------------------
 
 
 def repeated_pictures(digests: Mapping[int, PictureDigest]) -> Int64[np.ndarray, "R"]:

@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
-from flowlab.recordings.content import PictureDigest, digest, motion_checks, repeated_pictures
+from flowlab.recordings.content import PictureDigest, digest, repeated_pictures
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.pose_steps import check_steps
 from flowlab.recordings.poses import check_known, poses_at
 from flowlab.recordings.repeats import find_repeats
+from flowlab.recordings.stream_offsets import check_offsets
 from flowlab.recordings.sync import nearest_sample
 from flowlab.recordings.verdicts import Check
 
@@ -134,7 +135,7 @@ def check_frames(
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state, rendered=rendered)
     told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
-    checks = (repeats, *motion_checks(streams, told[0], told[1], stated or {}))
+    checks = (repeats, *check_offsets(streams, told[0], told[1], stated or {}))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from flowlab.recordings.verdicts import Check, Verdict
 
-_FEWEST = 20
+FEWEST = 20
 """So many instants are needed to tell an offset."""
 _UNEVEN = 0.3
 """Motion tells where it varies by this share of its mean."""
@@ -17,7 +17,8 @@ _MARGIN = 0.2
 """By so much the correlation at an offset exceeds that without it, or the offset is none."""
 _SURE = (0.9, 0.4)
 """Correlation and margin beyond which there is no doubt."""
-_FARTHEST_S = 3.0
+FARTHEST_S = 3.0
+"""Greatest offset that is tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,53 +37,72 @@ class Motion:
         return cls(name, time_s[1:] - step / 2, change / np.maximum(step, 1e-6))
 
 
-def check_motion(pictures: Motion, other: Motion, stated: float | None) -> Check:
-    """Whether another stream moves when the color pictures do. The offset is only reported, never applied.
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """How much later one stream moves than another."""
 
-    Args:
-        pictures: Of the color pictures.
-        other: Of the depth pictures, or of the robot.
-        stated: What the user has added to the times of the other [s]; None where nothing was said.
-    """
-    about = f"motion of {other.name}"
-    found = _offset(pictures, other)
-    if found is None:
-        return Check(about, Verdict.ASSUMED, "too little motion to tell an offset from color, so it is taken as none")
-    offset_s, like, margin, step_s = found
-    if like < _LIKE:
-        says = f"not like that of color (correlation {like:.2f}), so it tells no offset, which is taken as none"
-        return Check(about, Verdict.ASSUMED, says)
-    if margin < _MARGIN or abs(offset_s) < 0.75 * step_s:
-        return Check(about, Verdict.OK, f"goes with that of color (correlation {like:.2f})")
-    when = "after" if offset_s > 0 else "before"
-    says = f"{abs(offset_s):.2f} s {when} that of color (correlation {like:.2f}, {like - margin:.2f} without it)"
-    key = "depth_offset_s" if other.name == "depth" else "state_offset_s"
-    if stated is not None:
-        says += f", with '{key}: {stated:g}' added, which is taken as it is written"
-        verdict = Verdict.DOUBTFUL if stated else Verdict.ASSUMED  # 0 is the answer to what is asked below
-        return Check(about, verdict, f"{says}; '{key}: {stated - offset_s:.3g}' would make them go together")
-    sure = like >= _SURE[0] and margin >= _SURE[1] and other.name == "depth"
-    write = f"if their clocks differ, write '{key}: {-offset_s:.3g}', else '{key}: 0'"
-    return Check(about, Verdict.REFUSED if sure else Verdict.DOUBTFUL, f"{says}; {write}")
+    later_s: float
+    """0 where they go together."""
+    like: float
+    """Correlation of the two motions at that offset."""
+    without: float
+    """The same without it."""
+    told: bool
+    """Whether the two are one motion; else nothing is known."""
+    sure: bool
+    """Whether there is no doubt that it is not 0."""
 
 
-def _offset(one: Motion, other: Motion) -> tuple[float, float, float, float] | None:
-    """How much later the other moves [s], the correlation there, its margin over none, and the step of the search."""
-    if min(len(one.time_s), len(other.time_s)) < _FEWEST:
+def find_offset(pictures: Motion, other: Motion) -> Offset | None:
+    """How much later another stream moves than the color pictures, by how much each does at a time; None where too
+    little moves to tell."""
+    if min(len(pictures.time_s), len(other.time_s)) < FEWEST:
         return None
-    step = float(np.median(np.diff(one.time_s)))
-    start, stop = max(one.time_s[0], other.time_s[0]), min(one.time_s[-1], other.time_s[-1])
+    step = float(np.median(np.diff(pictures.time_s)))
+    start, stop = max(pictures.time_s[0], other.time_s[0]), min(pictures.time_s[-1], other.time_s[-1])
     clock = np.arange(start, stop, step)
-    if len(clock) < _FEWEST or step <= 0:
+    if len(clock) < FEWEST or step <= 0:
         return None
-    series = [_on(clock, m) for m in (one, other)]
+    series = [_on(clock, m) for m in (pictures, other)]
     if any(np.std(s) < _UNEVEN * np.mean(s) or not np.std(s) for s in series):
         return None
-    farthest = int(min(_FARTHEST_S / step, len(clock) / 3))
+    farthest = int(min(FARTHEST_S / step, len(clock) / 3))
     lags = np.arange(-farthest, farthest + 1)
     like = np.array([_correlation(series[0], series[1], int(lag)) for lag in lags])
     best = int(np.argmax(like))
-    return float(lags[best] * step), float(like[best]), float(like[best] - like[farthest]), step
+    most, margin = float(like[best]), float(like[best] - like[farthest])
+    is_one = margin >= _MARGIN
+    sure = is_one and most >= _SURE[0] and margin >= _SURE[1]
+    return Offset(float(lags[best] * step) if is_one else 0.0, most, most - margin, most >= _LIKE, sure)
+
+
+def check_offset(name: str, offset: Offset | None, key: str, stated: float | None, *, refusable: bool = False) -> Check:
+    """Whether another stream moves when the color pictures do. The offset is only reported, never applied.
+
+    Args:
+        name: Of the other stream.
+        offset: How much later it moves; None where too little does to tell.
+        key: What the user writes to add to its times.
+        stated: What the user has written there [s]; None where nothing was said.
+        refusable: Whether an offset without doubt is refused.
+    """
+    about = f"motion of {name}"
+    if offset is None:
+        return Check(about, Verdict.ASSUMED, "too little motion to tell an offset from color, so it is taken as none")
+    if not offset.told:
+        like = f"correlation {offset.like:.2f}, {offset.without:.2f} without one"
+        return Check(about, Verdict.ASSUMED, f"tells no offset from color ({like}), so it is taken as none")
+    if not offset.later_s:
+        return Check(about, Verdict.OK, f"goes with that of color (correlation {offset.like:.2f})")
+    when = "after" if offset.later_s > 0 else "before"
+    says = (f"{abs(offset.later_s):.2f} s {when} that of color (correlation {offset.like:.2f}, {offset.without:.2f} "
+            "without it)")  # fmt: skip
+    if stated is not None:
+        says += f", with '{key}: {stated:g}' added, which is taken as it is written"
+        verdict = Verdict.DOUBTFUL if stated else Verdict.ASSUMED  # 0 is the answer to what is asked below
+        return Check(about, verdict, f"{says}; '{key}: {stated - offset.later_s:.3g}' would make them go together")
+    write = f"if their clocks differ, write '{key}: {-offset.later_s:.3g}', else '{key}: 0'"
+    return Check(about, Verdict.REFUSED if offset.sure and refusable else Verdict.DOUBTFUL, f"{says}; {write}")
 
 
 def _on(clock: Float64[np.ndarray, "T"], motion: Motion) -> Float64[np.ndarray, "T"]:

@@ -1,0 +1,49 @@
+"""Whether depth and the robot move when the color pictures change."""
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+
+from flowlab.recordings.base import ImageStream, Streams
+from flowlab.recordings.content import PictureDigest, change_between
+from flowlab.recordings.depth_lag import LIKE, find_depth_lag
+from flowlab.recordings.motion import Motion, check_offset, find_offset
+from flowlab.recordings.verdicts import Check
+
+
+def check_offsets(
+    streams: Streams,
+    color: Mapping[int, PictureDigest],
+    depth: Mapping[int, PictureDigest],
+    stated: Mapping[str, float],
+) -> tuple[Check, ...]:
+    """Whether depth and the robot move when the color pictures change.
+
+    Args:
+        streams: The recording.
+        color: What is kept of color pictures, by index.
+        depth: Likewise of depth pictures.
+        stated: What the user has added to the times of a stream [s]: of depth, of state.
+    """
+    if len(color) < 2 or len(depth) < 2:
+        return ()
+    pictures = _motion_of("color", streams.color, color)
+    lag = find_depth_lag(streams, color, depth)
+    if lag is None or lag.like < LIKE:
+        lag = find_offset(pictures, _motion_of("depth", streams.depth, depth))
+    found = [check_offset("depth", lag, "depth_offset_s", stated.get("depth"), refusable=True)]
+    for s in streams.state[:1]:
+        if len(s.time_s) > 1 and s.values.shape[1]:
+            reach = np.maximum(np.ptp(s.values, axis=0), 1e-9)
+            change = np.linalg.norm(np.diff(s.values, axis=0) / reach, axis=1).astype(np.float64)
+            offset = find_offset(pictures, Motion.make("the robot", s.time_s, change))
+            found.append(check_offset("the robot", offset, "state_offset_s", stated.get("state")))
+    return tuple(found)
+
+
+def _motion_of(name: str, stream: ImageStream, digests: Mapping[int, PictureDigest]) -> Motion:
+    """When the pictures of a stream change, of those that were looked at."""
+    kept = sorted(digests)
+    change = np.array([change_between(digests[a], digests[b]) for a, b in pairwise(kept)], np.float64)
+    return Motion.make(name, stream.time_s[kept], change)
