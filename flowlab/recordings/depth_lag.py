@@ -23,6 +23,8 @@ _SURE_LIKE, _PLACES = 0.13, 10
 _ASIDE = tuple(product((-1, 0, 1), range(-4, 5)))
 """Cells that depth is moved by, down and across, without a lag: where it does not lie on color, what moves would seem
 to be late."""
+_BLOCKS = 16
+"""Cells are transformed in so many parts: all at once would take gigabytes of a long recording."""
 _NOTHING = 1e-12
 
 
@@ -123,7 +125,11 @@ def _like_at_lags(one: np.ndarray, other: np.ndarray, farthest: int) -> Float64[
     count = len(one)
     a, b = (x.reshape(count, -1) for x in (one, other))
     size = fft.next_fast_len(2 * count, real=True)
-    together = fft.irfft((np.conj(fft.rfft(a, size, axis=0)) * fft.rfft(b, size, axis=0)).sum(1), size)
+    spectrum = np.zeros(size // 2 + 1, complex)
+    for some in np.array_split(np.arange(a.shape[1]), _BLOCKS):
+        x, y = (fft.rfft(part[:, some], size, axis=0) for part in (a, b))
+        spectrum += (x.conj() * y).sum(1)
+    together = fft.irfft(spectrum, size)
     sums = [np.concatenate([[0.0], np.cumsum((x**2).sum(1))]) for x in (a, b)]
     lags = np.arange(-farthest, farthest + 1)
     first, last = np.maximum(0, -lags), count - np.maximum(0, lags)

@@ -84,7 +84,7 @@ def offset_of(color: np.ndarray, depth: np.ndarray, color_s: np.ndarray, depth_s
 @settings(max_examples=20, deadline=None)
 def test_streams_of_other_rates_are_compared_on_one_clock(seed: int, late: int, rate: int) -> None:
     rng = np.random.default_rng(seed)
-    path = np.cumsum(rng.normal(0, 1.2, (90, 2)), axis=0) + [12, 16]
+    path = np.add(np.cumsum(rng.normal(0, 1.2, (90, 2)), axis=0), (12, 16))
     v, u = np.mgrid[:24, :32]
     near = [((v - y) ** 2 + (u - x) ** 2 < 16) for y, x in np.mod(path, (24, 32))]
     color = np.stack([np.where(n, 200.0, 60.0) for n in near]) + rng.normal(0, 2, (90, 24, 32))
