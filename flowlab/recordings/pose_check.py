@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 from flowlab.geometry.transforms import rigid
 from flowlab.recordings.pose_pairs import FlowPair, floor_m, flow_pairs
 from flowlab.recordings.pose_readings import READINGS
+from flowlab.recordings.pose_scale import estimate_scale, scaled
 from flowlab.recordings.pose_steps import come_again
 from flowlab.recordings.poses import poses_at
 from flowlab.recordings.verdicts import Check, Verdict
@@ -76,6 +77,8 @@ def _judged(source: "ParsedRecording", pairs: list[FlowPair], off: float, fixed:
         return Verdict.REFUSED, (
             f", within {1000 * others[how]:.1f} mm if each were {how}: T_world_cam must map coordinates of the camera "
             "(x right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
+    if (wrong := _judged_scale(pairs, T, off)) is not None:
+        return wrong
     contradicted = [p for p in pairs if _contradicts(p, T, floor)]
     if 0 < len(contradicted) < _MOST * len(pairs):
         return _judged_in_part(source, contradicted, len(pairs))
@@ -88,6 +91,19 @@ def _judged(source: "ParsedRecording", pairs: list[FlowPair], off: float, fixed:
     return Verdict.REFUSED if worse and off > _ERRS * floor else Verdict.DOUBTFUL, (
         f": {why}; the poses must be those of the color camera itself (x right, y down, z forward), not of a flange or "
         "another camera, in meters, on the clock of the pictures ('T_world_cam_offset_s')")  # fmt: skip
+
+
+def _judged_scale(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: float) -> tuple[Verdict, str] | None:
+    """What follows where the camera moves farther, or less far, by its pictures than by its poses."""
+    scale = estimate_scale(pairs, T)
+    if scale is None or scale.share <= 0:
+        return None
+    best = _off_m(pairs, scaled(T, scale.share))
+    verdict = scale.judged(best / max(off, 1e-9))
+    return None if verdict is Verdict.OK else (verdict, (
+        f", within {1000 * best:.1f} mm if the camera had moved {scale.share:.2f} times as far: poses are in another "
+        "unit or of no known scale, as of SLAM with one camera, or 'depth_unit_m' or the focal length is wrong; "
+        "correct which it is"))  # fmt: skip
 
 
 def _contradicts(pair: FlowPair, T: Float[np.ndarray, "T 4 4"], floor: float) -> bool:

@@ -21,6 +21,7 @@ import flowlab
 from flowlab.geometry.camera import Camera
 from flowlab.geometry.transforms import inverse
 from flowlab.recordings.parsing import RecordingSettings, parse_recording
+from flowlab.recordings.pose_scale import scaled
 from flowlab.recordings.preview import preview_recording
 from flowlab.recordings.readers.plain import write_rgbd_recording
 from flowlab.records import Episode
@@ -236,6 +237,9 @@ LATE = np.stack([pose(t - 0.3) for t in CLOCK])
         (MILLIMETERS, "refused", "in millimeters"),
         (LATE, "refused", "-0.3 s were added .* write 'T_world_cam_offset_s: -0.3'"),
         (np.stack([pose(t + 0.1) for t in CLOCK]), "doubtful", "0.1 s were added"),
+        (scaled(POSES, 0.7), "refused", r"moved 1\.4\d times as far: poses are in another unit or of no known scale"),
+        (scaled(POSES, 1.5), "refused", r"moved 0\.6\d times as far"),
+        (scaled(POSES, 0.87), "doubtful", r"moved 1\.1\d times as far"),
         (POSES[::-1].copy(), "refused", "explain too little|must be those of the color camera itself"),
         (POSES @ looking((0.1, -0.2, 0.05)), "refused", "not of a flange"),
         (np.tile(POSES[:1], (len(POSES), 1, 1)), "refused", "explain too little"),
