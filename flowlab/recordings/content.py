@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float32, Int64, Num
 
 _TILES = 8
 """A picture is looked at in so many rows and columns of tiles."""
+CELLS = (48, 64)
+"""And changes are told in so many rows and columns of cells."""
 _NOISY = (0.3, 0.7)
 """Noise changes this share of the pixels from picture to picture, in this share of the pairs."""
 _UNLIKE = -0.2
@@ -30,6 +32,8 @@ class PictureDigest:
     """Likewise of every tile; 0 where all of its pixels are alike."""
     small: Num[np.ndarray, "h w"]
     """The picture, thinned, to tell how much has changed."""
+    cells: Num[np.ndarray, "48 64"]
+    """The same by more pixels, as they are in the picture, to tell where."""
 
 
 def digest(picture: np.ndarray) -> PictureDigest:
@@ -42,7 +46,8 @@ def digest(picture: np.ndarray) -> PictureDigest:
     pixel = picture[:1, :1].nbytes
     sums = [zlib.crc32(tile) for tile in tiles]
     plain = tuple(0 if tile == tile[:pixel] * (len(tile) // pixel) else n for tile, n in zip(tiles, sums, strict=True))
-    return PictureDigest(zlib.crc32(np.array(sums, np.uint32).tobytes()), plain, small)
+    places = [((np.arange(n) + 0.5) * side / n).astype(int) for n, side in zip(CELLS, gray.shape, strict=True)]
+    return PictureDigest(zlib.crc32(np.array(sums, np.uint32).tobytes()), plain, small, gray[np.ix_(*places)])
 
 
 def repeated_pictures(digests: Mapping[int, PictureDigest]) -> Int64[np.ndarray, "R"]:

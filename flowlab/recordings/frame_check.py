@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 
 from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, repeated_pictures
+from flowlab.recordings.depth_aside import DepthAside, find_depth_aside
 from flowlab.recordings.frame_processing import Size
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.pose_steps import check_steps
@@ -60,6 +61,8 @@ class FrameCheck:
     """Indices of the pictures of ``color`` and ``depth`` that are the same as the one looked at before."""
     T_world_cam: Float64[np.ndarray, "T 4 4"] | None = None
     """The pose of a camera that moves, at every row."""
+    aside: DepthAside | None = None
+    """Where depth changes when color does; None where too few pictures tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +155,7 @@ def check_frames(
         color=rows[:, 0], depth=rows[:, 1], bad=tuple(bad), looked_at=len(frames), color_size=color_size,
         depth_size=depth_size, median_counts=median, sync_s=sync, checks=checks, samples=samples,
         skipped=np.array(skipped, np.int64), repeated=repeated, T_world_cam=T_world_cam,
+        aside=find_depth_aside(rows, *digests),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 from scipy import fft
 
+from flowlab.recordings.depth_aside import DepthAside
 from flowlab.recordings.image_files import exif_turns
 from flowlab.recordings.lens import undistorted_rays
 from flowlab.recordings.picture_samples import PictureSample
@@ -180,7 +181,8 @@ def check_registration(source: "ParsedRecording") -> Check:
     samples, seen, turned = source.frame_check.samples, source.frame_check, _turned(source)
     if how is None:
         return Check("registration", Verdict.DOUBTFUL, "depth is seen from a camera of its own, and not registered yet")
-    if source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None:
+    known_apart = source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None
+    if known_apart:
         samples = tuple(_registered(source))
     elif seen.color_size != seen.depth_size:
         (w, h), (width, height) = seen.depth_size, seen.color_size
@@ -188,7 +190,7 @@ def check_registration(source: "ParsedRecording") -> Check:
                      f"it is not registered to color{turned}; give 'depth_intrinsics' and 'T_color_depth' in "
                      f"{source.write_to}")  # fmt: skip
     found = estimate_misalignment(samples)
-    verdict, says = _judged(found, stated)
+    verdict, says = _judged(found, stated, None if known_apart else seen.aside)
     if verdict is not Verdict.OK and (how_turned := _fits_turned(samples, found)):
         verdict, says = max(verdict, Verdict.DOUBTFUL, key=lambda v: v.severity), how_turned
     if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL) or (turned and verdict is not Verdict.OK):
@@ -202,11 +204,11 @@ def check_registration(source: "ParsedRecording") -> Check:
     return Check("registration", verdict, f"{how}{says}{turned and f'{turned}, and is taken as it is stored'}")
 
 
-def _judged(found: Misalignment | None, stated: bool) -> tuple[Verdict, str]:
+def _judged(found: Misalignment | None, stated: bool, aside: DepthAside | None) -> tuple[Verdict, str]:
     """What the pictures say: depth that is off by little, or not clearly, is let pass."""
     untold = Verdict.OK if stated else Verdict.ASSUMED
     if found is None:
-        return untold, "; too few edges in the pictures to tell"
+        return _by_changes(aside) or (untold, "; too few edges in the pictures to tell")
     where = (f"moved by ({found.shift_px[0]:g}, {found.shift_px[1]:g}) px and sized by {found.scale:.2f} "
              f"(gain {found.gain:.2f}, clarity {found.clarity:.1f})")  # fmt: skip
     for k, verdict in ((1, Verdict.REFUSED), (0, Verdict.DOUBTFUL)):
@@ -219,7 +221,19 @@ def _judged(found: Misalignment | None, stated: bool) -> tuple[Verdict, str]:
         return Verdict.DOUBTFUL, (f", but edges of depth lie on none of color's ({found.here:.2f} standard deviations "
                                   f"above the mean, expected {_LIES} and more), and fit nowhere else: it may be "
                                   "turned, mirrored, or of another camera or time")  # fmt: skip
-    return untold, f"; edges of depth fit edges of color nowhere well enough to tell (clarity {found.clarity:.1f})"
+    nowhere = f"; edges of depth fit edges of color nowhere well enough to tell (clarity {found.clarity:.1f})"
+    return _by_changes(aside) or (untold, nowhere)
+
+
+def _by_changes(aside: DepthAside | None) -> tuple[Verdict, str] | None:
+    """What is told by where the pictures change; None where it is nothing."""
+    if aside is None or aside.lies is None:
+        return None
+    if aside.lies:
+        return Verdict.OK, f", and the pictures agree: depth changes where color does (correlation {aside.like:.2f})"
+    right, down = (f"{100 * share:.0f} %" for share in aside.shift)
+    return Verdict.DOUBTFUL, (f", but depth changes where color does when moved by {right} of the width and {down} of "
+                              f"the height (correlation {aside.like:.2f})")  # fmt: skip
 
 
 def _turned(source: "ParsedRecording") -> str:

@@ -7,8 +7,9 @@ import numpy as np
 
 from flowlab.recordings.base import ImageStream, Streams
 from flowlab.recordings.content import PictureDigest, change_between
-from flowlab.recordings.depth_lag import LIKE, find_depth_lag
+from flowlab.recordings.depth_lag import LAG_CELLS, LIKE, find_depth_lag
 from flowlab.recordings.motion import Motion, check_offset, find_offset
+from flowlab.recordings.picture_changes import find_changes
 from flowlab.recordings.verdicts import Check
 
 
@@ -29,7 +30,8 @@ def check_offsets(
     if len(color) < 2 or len(depth) < 2:
         return ()
     pictures = _motion_of("color", streams.color, color)
-    lag = find_depth_lag(streams, color, depth)
+    changes = find_changes(streams, color, depth, LAG_CELLS)
+    lag = None if changes is None else find_depth_lag(changes)
     if lag is None or lag.like < LIKE:
         lag = find_offset(pictures, _motion_of("depth", streams.depth, depth))
     found = [check_offset("depth", lag, "depth_offset_s", stated.get("depth"), refusable=True)]

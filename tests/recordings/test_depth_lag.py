@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_recordings import write_png, write_yaml
 
-from flowlab.recordings.depth_lag import _like_at_lags, find_depth_lag
+from flowlab.recordings.depth_lag import LAG_CELLS, _like_at_lags, find_depth_lag
 from flowlab.recordings.motion import Offset
+from flowlab.recordings.picture_changes import find_changes
 
 Capture = pytest.CaptureFixture[str]
 SIZE, FPS, FRAMES = (160, 120), 10, 36
@@ -77,7 +78,8 @@ def test_an_offset_that_is_written_is_applied(
 def offset_of(color: np.ndarray, depth: np.ndarray, color_s: np.ndarray, depth_s: np.ndarray) -> Offset | None:
     streams = SimpleNamespace(color=SimpleNamespace(time_s=color_s), depth=SimpleNamespace(time_s=depth_s))
     kept = [{k: SimpleNamespace(small=x) for k, x in enumerate(pictures)} for pictures in (color, depth)]
-    return find_depth_lag(streams, *kept)  # type: ignore[arg-type]
+    changes = find_changes(streams, *kept, LAG_CELLS)  # type: ignore[arg-type]
+    return None if changes is None else find_depth_lag(changes)
 
 
 @given(seed=st.integers(0, 10_000), late=st.integers(-4, 4), rate=st.sampled_from([1, 2]))
