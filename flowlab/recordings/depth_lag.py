@@ -3,7 +3,7 @@
 from itertools import product
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy import fft
 
 from flowlab.recordings.motion import FARTHEST_S, Offset
@@ -14,9 +14,11 @@ LAG_CELLS = (24, 32)
 LIKE, _OF_LIKE = 0.05, 0.8
 """Changes that correlate by this have one cause; and a lag is one where without it, they correlate by less than this
 share of that."""
+_AS_WELL = 0.85
+"""Changes that correlate by this share of what they do at the best lag do so about as well."""
 _SURE_LIKE, _PLACES = 0.13, 10
 """So much they must correlate at a lag that is sure, by so many cells at least."""
-_ASIDE = tuple(product((-1, 0, 1), range(-4, 5)))
+_ASIDE = tuple(product(range(-3, 4), range(-5, 6)))
 """Cells that depth is moved by, down and across, without a lag: where it does not lie on color, what moves would seem
 to be late."""
 _BLOCKS = 16
@@ -36,13 +38,25 @@ def find_depth_lag(changes: PictureChanges) -> Offset:
 
 
 def _offset(one: np.ndarray, other: np.ndarray, step: float) -> Offset:
-    """At which lag changes are most alike, and whether that is told."""
+    """At which lag changes are most alike, the least of several that are so about as much, and whether that is told."""
     like = _like_at_lags(one, other, int(min(FARTHEST_S / step, len(one) / 4)))
-    late, most, without = int(np.argmax(like)) - len(like) // 2, float(like.max()), float(like[len(like) // 2])
+    lags = _peaks(like)
+    late, without = int(lags[0]), float(like[len(like) // 2])
+    most = float(like[len(like) // 2 + late])
+    told = most >= LIKE and (_anywhere(one, other) < _OF_LIKE * most if late else len(lags) == 1)
     pairs = _later(one, other, late)
-    told = most >= LIKE and (not late or _anywhere(one, other) < _OF_LIKE * most)
-    sure = told and abs(late) > 1 and all(_is_surely_late(*part, late) for part in (pairs, *_halves(*pairs)))
-    return Offset(late * step, most, without, told, sure)
+    surely = told and len(lags) == 1 and abs(late) > 1
+    sure = surely and all(_is_surely_late(*part, late) for part in (pairs, *_halves(*pairs)))
+    return Offset(late * step, most, without, told, sure, len(lags) > 1)
+
+
+def _peaks(like: Float64[np.ndarray, "L"]) -> Int64[np.ndarray, "n"]:
+    """The lags at which changes are about as alike as at the best, the least first: several of what goes on
+    periodically."""
+    padded = np.pad(like, 1, constant_values=-np.inf)
+    peak = (like >= padded[:-2]) & (like >= padded[2:]) & (like >= like.max() - (1 - _AS_WELL) * abs(like.max()))
+    lags = np.flatnonzero(peak) - len(like) // 2
+    return lags[np.argsort(np.abs(lags), kind="stable")]
 
 
 def _anywhere(one: np.ndarray, other: np.ndarray) -> float:

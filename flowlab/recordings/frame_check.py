@@ -90,6 +90,7 @@ def check_frames(
     pose_gap_s: float = 0.0,
     stated: Mapping[str, float] | None = None,
     rendered: bool = False,
+    aligned: bool = True,
 ) -> FrameCheck:
     """Decode every picture that is asked for, and pair them.
 
@@ -97,7 +98,8 @@ def check_frames(
     depth reading at all; where no depth is within ``max_sync_s`` or no state within ``max_state_s``, and at most half
     an interval; where no poses of a camera that moves are around it that are at most ``pose_gap_s`` apart; and where
     its time does not lie after the frame before. ``stated`` is what the user has added to
-    the times of a stream, ``rendered`` whether equal pictures without noise are right.
+    the times of a stream, ``rendered`` whether equal pictures without noise are right, ``aligned`` whether
+    depth is seen from the color camera, by what is known.
     """
     frames = _selected(streams.color, every, start_s, stop_s)
     clock = streams.color.time_s[frames]
@@ -138,7 +140,7 @@ def check_frames(
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state, rendered=rendered)
     told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
-    checks = (repeats, *check_offsets(streams, told[0], told[1], stated or {}))
+    checks = (repeats, *check_offsets(streams, told[0], told[1], stated or {}, aligned=aligned))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)
@@ -155,7 +157,7 @@ def check_frames(
         color=rows[:, 0], depth=rows[:, 1], bad=tuple(bad), looked_at=len(frames), color_size=color_size,
         depth_size=depth_size, median_counts=median, sync_s=sync, checks=checks, samples=samples,
         skipped=np.array(skipped, np.int64), repeated=repeated, T_world_cam=T_world_cam,
-        aside=find_depth_aside(rows, *digests),
+        aside=find_depth_aside(rows, *digests) if aligned else None,
     )  # fmt: skip
 
 

@@ -51,6 +51,8 @@ class Offset:
     """Whether the two are one motion; else nothing is known."""
     sure: bool
     """Whether there is no doubt that it is not 0."""
+    periodic: bool = False
+    """Whether others fit about as well, as of what goes on periodically."""
 
 
 def find_offset(pictures: Motion, other: Motion) -> Offset | None:
@@ -97,6 +99,8 @@ def check_offset(name: str, offset: Offset | None, key: str, stated: float | Non
     when = "after" if offset.later_s > 0 else "before"
     says = (f"{abs(offset.later_s):.2f} s {when} that of color (correlation {offset.like:.2f}, {offset.without:.2f} "
             "without it)")  # fmt: skip
+    if offset.periodic:
+        says += "; what moves does so periodically, and other offsets fit about as well"
     if stated is not None:
         says += f", with '{key}: {stated:g}' added, which is taken as it is written"
         verdict = Verdict.DOUBTFUL if stated else Verdict.ASSUMED  # 0 is the answer to what is asked below

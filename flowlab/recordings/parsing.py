@@ -159,6 +159,9 @@ def parse_recording(path: Path, settings: RecordingSettings) -> ParsedRecording:
         pose_gap_s=most_apart_s(streams.color, metadata.T_world_cam_gap_s),
         stated={s: off for s in ("depth", "state") if (off := getattr(metadata, f"{s}_offset_s")) is not None},
         rendered=metadata.rendered,
+        aligned=streams.registered is not False
+        and metadata.depth_intrinsics is None
+        and metadata.T_color_depth is None,
     )
     return ParsedRecording(path, reader, streams, metadata, origin, seen)
 

@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64, Num
 from flowlab.recordings.base import Streams
 from flowlab.recordings.content import PictureDigest
 from flowlab.recordings.motion import FEWEST
+from flowlab.recordings.sync import nearest_sample
 
 _GRAY, _OF_DEPTH = 40.0, 0.05
 """So many gray levels, and so much of the depth, are the greatest change that counts: something came, or went."""
@@ -41,11 +42,23 @@ def find_changes(
         return None
     middle = [(t[1:] + t[:-1]) / 2 for t in times]
     step = float(max(np.median(np.diff(t)) for t in times))
-    clock = np.arange(max(m[0] for m in middle), min(m[-1] for m in middle) + 1e-6, step) if step > 0 else np.empty(0)
+    clock = _clock(middle, step)
     if len(clock) < FEWEST:
         return None
     seen, read = color_changes(_thinned(color, cells)), depth_changes(_thinned(depth, cells))
     return PictureChanges(_on(clock, middle[0], seen), _on(clock, middle[1], read), step)
+
+
+def _clock(times: list[Float64[np.ndarray, "_"]], step: float) -> Float64[np.ndarray, "T"]:
+    """Instants a step apart at which both were seen within a step; not those of a pause."""
+    start, stop = max(t[0] for t in times), min(t[-1] for t in times)
+    if not (step > 0 and stop > start):
+        return np.empty(0)
+    near = np.concatenate([np.floor((t - start) / step)[:, None] + np.arange(-1, 3) for t in times])
+    clock = start + step * np.unique(near)
+    clock = clock[(clock >= start) & (clock <= stop + 1e-6)]
+    seen = [np.abs(t[nearest_sample(clock, t)] - clock) <= step for t in times]
+    return clock[np.logical_and.reduce(seen)]
 
 
 def alike(one: np.ndarray, other: np.ndarray) -> float:

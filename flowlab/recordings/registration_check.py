@@ -181,8 +181,7 @@ def check_registration(source: "ParsedRecording") -> Check:
     samples, seen, turned = source.frame_check.samples, source.frame_check, _turned(source)
     if how is None:
         return Check("registration", Verdict.DOUBTFUL, "depth is seen from a camera of its own, and not registered yet")
-    known_apart = source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None
-    if known_apart:
+    if source.metadata.depth_intrinsics is not None and source.metadata.T_color_depth is not None:
         samples = tuple(_registered(source))
     elif seen.color_size != seen.depth_size:
         (w, h), (width, height) = seen.depth_size, seen.color_size
@@ -190,7 +189,7 @@ def check_registration(source: "ParsedRecording") -> Check:
                      f"it is not registered to color{turned}; give 'depth_intrinsics' and 'T_color_depth' in "
                      f"{source.write_to}")  # fmt: skip
     found = estimate_misalignment(samples)
-    verdict, says = _judged(found, stated, None if known_apart else seen.aside)
+    verdict, says = _judged(found, stated, seen.aside)
     if verdict is not Verdict.OK and (how_turned := _fits_turned(samples, found)):
         verdict, says = max(verdict, Verdict.DOUBTFUL, key=lambda v: v.severity), how_turned
     if verdict in (Verdict.REFUSED, Verdict.DOUBTFUL) or (turned and verdict is not Verdict.OK):

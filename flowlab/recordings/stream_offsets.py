@@ -18,6 +18,8 @@ def check_offsets(
     color: Mapping[int, PictureDigest],
     depth: Mapping[int, PictureDigest],
     stated: Mapping[str, float],
+    *,
+    aligned: bool,
 ) -> tuple[Check, ...]:
     """Whether depth and the robot move when the color pictures change.
 
@@ -26,11 +28,12 @@ def check_offsets(
         color: What is kept of color pictures, by index.
         depth: Likewise of depth pictures.
         stated: What the user has added to the times of a stream [s]: of depth, of state.
+        aligned: Whether depth is seen from the color camera, by what is known.
     """
     if len(color) < 2 or len(depth) < 2:
         return ()
     pictures = _motion_of("color", streams.color, color)
-    changes = find_changes(streams, color, depth, LAG_CELLS)
+    changes = find_changes(streams, color, depth, LAG_CELLS) if aligned else None
     lag = None if changes is None else find_depth_lag(changes)
     if lag is None or lag.like < LIKE:
         lag = find_offset(pictures, _motion_of("depth", streams.depth, depth))

@@ -127,7 +127,7 @@ def test_a_hole_of_more_than_half_stays_a_gap(tmp_path: Path, inspect: Inspect) 
 def test_streams_counted_from_different_origins_are_asked_about(
     tmp_path: Path, inspect: Inspect, color: range, depth: range
 ) -> None:
-    one, other = named(NUMBER, color), {NUMBER(n): k for k, n in enumerate(depth)}
+    one, other = ({NUMBER(n): k for k, n in enumerate(numbers)} for numbers in (color, depth))
     assert_refused(inspect(write(tmp_path / "r", one, other, fps=FPS)), "numbers:", "'depth_offset_s: 0'")
     if color[0] == 1 and depth[0] == 0:
         facts = assert_fine(inspect(write(tmp_path / "r", one, other, fps=FPS, depth_offset_s=0.1)))
