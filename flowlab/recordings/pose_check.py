@@ -25,7 +25,7 @@ _ERRS = 1.5
 """Times what sensors and flow err by, from which on poses are wrong."""
 _SOME, _SOME_PAIRS = 0.2, 0.25
 """Poses are wrong for some of the time where not even so many of the points stay; of 73 films with true poses, one pair
-of eight has that in two. Refused are poses of which so many pairs have it, two at least."""
+of eight has that in two. Refused are poses that explain nothing in so many pairs, two at least."""
 _BETTER = 0.5
 """Another reading of the poses is the right one where it leaves less than this share of what they leave."""
 _SHIFTED = 0.6
@@ -45,7 +45,8 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     """Whether the scene stands still under the poses, and whether it does so only by another reading of them."""
     T = source.frame_check.T_world_cam
     assert T is not None
-    pairs = [pair for pair in flow_pairs(source) if pair.is_rigid(floor_m([pair]))]
+    found = [pair.without_carried(T) for pair in flow_pairs(source)]
+    pairs = [pair for pair in found if pair.is_rigid(floor_m([pair]))]
     if not pairs:
         says = "it moves as its poses say; too little texture and depth in the pictures to tell whether these are right"
         return Check("camera", Verdict.ASSUMED, says)
@@ -88,7 +89,8 @@ def _judged(source: "ParsedRecording", pairs: list[FlowPair], off: float, fixed:
             ": that is too little to tell whether the poses are right"))  # fmt: skip
     worse = off > _EXPLAINED * fixed
     why = "they explain too little of it" if worse else "that is more than sensors err by"
-    return Verdict.REFUSED if worse and off > _ERRS * floor else Verdict.DOUBTFUL, (
+    refused = worse and off > _ERRS * floor and not _some_stays(pairs, T, floor)
+    return Verdict.REFUSED if refused else Verdict.DOUBTFUL, (
         f": {why}; the poses must be those of the color camera itself (x right, y down, z forward), not of a flange or "
         "another camera, in meters, on the clock of the pictures ('T_world_cam_offset_s')")  # fmt: skip
 
@@ -113,6 +115,13 @@ def _contradicts(pair: FlowPair, T: Float[np.ndarray, "T 4 4"], floor: float) ->
     return off > max(_ERRS * floor, _EXPLAINED * fixed) and pair.off_m(T, _SOME) > floor
 
 
+def _some_stays(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], floor: float) -> bool:
+    """Whether in most pairs some points stay that would move before a camera that stands still: then it may be that
+    something that moves fills most of the picture."""
+    shares = [((p.apart_m(T) <= floor) & (p.apart_m(_fixed(T)) > 2 * floor)).mean() for p in pairs]
+    return bool(np.median(shares) >= _SOME)
+
+
 def _judged_in_part(source: "ParsedRecording", contradicted: list[FlowPair], count: int) -> tuple[Verdict, str]:
     """What follows where the scene stays under the poses between most of ``count`` pairs of pictures, not between some:
     a camera whose tracking was lost for a while."""
@@ -120,7 +129,8 @@ def _judged_in_part(source: "ParsedRecording", contradicted: list[FlowPair], cou
     assert T is not None
     worst = max(contradicted, key=lambda p: p.off_m(T))
     first, second = (source.streams.color.names[int(source.frame_check.color[r])] for r in worst.rows)
-    many = len(contradicted) >= max(2, _SOME_PAIRS * count)
+    lost = sum(p.off_m(T) >= _NO_BETTER * p.off_m(_fixed(T)) for p in contradicted)
+    many = lost >= max(2, _SOME_PAIRS * count)
     return Verdict.REFUSED if many else Verdict.DOUBTFUL, (
         f", but not between {len(contradicted)} of them, by {1000 * worst.off_m(T):.1f} mm from {first} to {second}: "
         "the poses are wrong there, as where tracking of the camera was lost, or something that moves fills the "

@@ -1,7 +1,7 @@
 """Pairs of pictures that a camera took from different places, and the points that both show, found by flow."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from flowlab.errors import DataError
-from flowlab.geometry.transforms import apply
+from flowlab.geometry.transforms import apply, inverse
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.frame_processing import FrameProcessor
 
@@ -38,6 +38,8 @@ _FLOOR = (0.004, 0.01)
 """What sensors and flow err by: a length [m], and a share of the distance."""
 _OF_PIXEL = 0.3
 """And a share of a pixel of the small pictures that are compared."""
+_STAYS_PX, _MOVES_PX, _LEFT = 0.5, 2.0, 0.15
+"""What moves by less in the picture, where poses move it by more, goes along with the camera, if so much is left."""
 _REFITS = 4
 """Times that a rigid motion is fitted to the half of the points that fit best."""
 
@@ -50,7 +52,7 @@ class FlowPair:
     first: Float64[np.ndarray, "N 3"]
     second: Float64[np.ndarray, "N 3"]
     px: float
-    """How far they move in the picture, in the median [px]."""
+    """How far those that move do in the picture, in the median [px]."""
     pixel_rad: float
     """What a pixel of the small pictures spans [rad]."""
     width: int
@@ -72,10 +74,25 @@ class FlowPair:
             inside = left <= np.median(left)
         return bool(np.median(left) < off_m)
 
+    def apart_m(self, T: Float[np.ndarray, "T 4 4"]) -> Float64[np.ndarray, "N"]:
+        """How far apart they are in the world under poses [m]."""
+        a, b = (apply(T[r], p) for r, p in zip(self.rows, (self.first, self.second), strict=True))
+        return np.asarray(np.linalg.norm(a - b, axis=1))
+
     def off_m(self, T: Float[np.ndarray, "T 4 4"], share: float = 0.5) -> float:
         """How far apart they are in the world: so many of them by less."""
-        a, b = (apply(T[r], p) for r, p in zip(self.rows, (self.first, self.second), strict=True))
-        return float(np.quantile(np.linalg.norm(a - b, axis=1), share))
+        return float(np.quantile(self.apart_m(T), share))
+
+    def without_carried(self, T: Float[np.ndarray, "T 4 4"]) -> "FlowPair":
+        """The pair without what stays where it is in the picture though poses move the camera, as a gripper does before
+        a camera at the wrist; all of it where little else is left."""
+        first, second = self.rows
+        places = [
+            p[:, :2] / p[:, 2:] for p in (self.first, self.second, apply(inverse(T[second]) @ T[first], self.first))
+        ]
+        seen, said = (np.linalg.norm(there - places[0], axis=1) / self.pixel_rad for there in places[1:])
+        rest = ~((seen < _STAYS_PX) & (said > _MOVES_PX))
+        return self if rest.mean() < _LEFT else replace(self, first=self.first[rest], second=self.second[rest])
 
 
 def floor_m(pairs: list[FlowPair]) -> float:
@@ -160,9 +177,13 @@ def _matched(flow: "cv2.DISOpticalFlow", rows: tuple[int, int], one: _Taken, oth
     good &= ~edges[0] & (beside == 0) & np.isfinite(points_a).all(-1) & np.isfinite(second).all(-1)
     if good.sum() < _ENOUGH * good.size:
         return None
-    px = float(np.median(np.linalg.norm(there[good], axis=-1)))
+    px = np.linalg.norm(there[good], axis=-1)
+    if (px > _STAYS_PX).mean() >= _LEFT:
+        px = px[px > _STAYS_PX]
     some = slice(None, None, max(1, int(good.sum()) // _POINTS))
-    return FlowPair(rows, points_a[good][some], second[good][some], px, _pixel_rad(points_a), a.shape[1])
+    return FlowPair(
+        rows, points_a[good][some], second[good][some], float(np.median(px)), _pixel_rad(points_a), a.shape[1]
+    )
 
 
 def _pixel_rad(points: np.ndarray) -> float:

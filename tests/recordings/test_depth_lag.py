@@ -99,6 +99,46 @@ def test_streams_of_other_rates_are_compared_on_one_clock(seed: int, late: int, 
     assert found.told or late
 
 
+def test_of_what_goes_on_periodically_the_least_offset_is_told_and_that_others_fit() -> None:
+    v, u = np.mgrid[:24, :32]
+    near = [(v - 12) ** 2 + (u - 16 - 9 * np.sin(2 * np.pi * t / 10)) ** 2 < 16 for t in range(80)]
+    color = np.stack([np.where(n, 200.0, 60.0) for n in near]) + np.random.default_rng(0).normal(0, 2, (80, 24, 32))
+    depth = np.stack([np.where(n, 600.0, 900.0) for n in near])
+    clock = np.arange(77) / 10
+    found = offset_of(color[3:], depth[:77], clock, clock)
+    assert found is not None
+    assert (found.told, found.sure, found.periodic) == (True, False, True)
+    assert found.later_s == pytest.approx(0.3)
+    together = offset_of(color[3:], depth[3:], clock, clock)
+    assert together is not None
+    assert (together.told, together.later_s) == (False, 0)
+
+
+def test_a_pause_of_a_day_takes_no_room() -> None:
+    clock = np.r_[np.arange(30) / 10, 86_400 + np.arange(30) / 10]
+    stream = SimpleNamespace(time_s=clock)
+    kept = [{k: SimpleNamespace(small=np.zeros((24, 32))) for k in range(60)} for _ in "cd"]
+    changes = find_changes(SimpleNamespace(color=stream, depth=stream), *kept, LAG_CELLS)  # type: ignore[arg-type]
+    assert changes is not None
+    assert 50 < len(changes.color) < 70
+
+
+def test_depth_of_a_camera_of_its_own_is_not_late_for_lying_elsewhere(capsys: Capture, tmp_path: Path) -> None:
+    """What is lifted passes each height of the upper camera's picture later."""
+    scene, upper = (TABLE, WALL, FLOOR), np.eye(4)
+    upper[1, 3] = -0.05
+    eye = looking((0.0, -0.9, 0.7))
+    for k in range(28):
+        lifted = (*scene, BLOCK.moved((0.2, 0.1, 0.012 * k)))
+        write_png(tmp_path / "r" / "color" / f"{k:04d}.png", film(lifted, K, SIZE, eye, seed=k)[0])
+        counts = np.rint(film(lifted, K, SIZE, eye @ upper, seed=99 + k)[1] * 5000).astype(np.uint16)
+        write_png(tmp_path / "r" / "depth" / f"{k:04d}.png", counts)
+    keys = {"depth_intrinsics": GIVEN, "T_color_depth": upper.tolist()}
+    write_yaml(tmp_path / "r" / "recording.yaml", fps=FPS, depth_unit_m=0.0002, intrinsics=GIVEN, **keys)
+    verdict, says = dry_run(capsys, tmp_path / "r").checks["motion of depth"]
+    assert verdict in ("ok", "assumed"), says
+
+
 @given(seed=st.integers(0, 10_000), farthest=st.integers(1, 7))
 @settings(max_examples=20, deadline=None)
 def test_correlation_at_lags_is_that_of_the_overlap(seed: int, farthest: int) -> None:

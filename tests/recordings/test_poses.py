@@ -281,6 +281,19 @@ def test_true_poses_are_not_refused_for_a_hand_that_fills_the_picture(tmp_path: 
     assert (code, found["camera"][0]) in ((0, "ok"), (0, "doubtful")), problem
 
 
+@pytest.mark.parametrize(("T", "verdict"), [(POSES, "ok"), (scaled(POSES, 0.7), "refused"), (lost(3, 11), "doubtful")])
+def test_a_gripper_before_a_camera_at_the_wrist_says_nothing_of_its_poses(
+    frames: Frames, tmp_path: Path, capsys: Capture, T: np.ndarray, verdict: str
+) -> None:
+    texture = np.kron(np.random.default_rng(0).uniform(60, 200, (9, 20)), np.ones((8, 8)))[:, :, None]
+    held = [(rgb.copy(), depth.copy()) for rgb, depth in frames]
+    for k, (rgb, depth) in enumerate(held):  # it fills 60 % of the picture
+        noise = np.random.default_rng(k).normal(size=(2, 72, 160))
+        rgb[48:], depth[48:] = texture + 3 * noise[0][..., None], 0.25 + 0.0005 * noise[1]
+    code, found, problem, _ = looked_at(capsys, put(tmp_path / "r", held, T))
+    assert (code, found["camera"][0]) == (3 if verdict == "refused" else 0, verdict), problem
+
+
 def moved(rows: slice | list[int], by: float) -> np.ndarray:
     T = POSES.copy()
     T[rows, 0, 3] += by
