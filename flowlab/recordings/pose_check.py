@@ -32,6 +32,8 @@ _SHIFTED = 0.6
 """The same, of poses at other times."""
 _MOST = 0.75
 """In so many of the pairs."""
+_LEAST_PAIRS = 4
+"""Poses at other times are tried on half as many pairs at least."""
 _SHIFT_M = 0.003
 """And by no less than this [m]."""
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
@@ -62,7 +64,8 @@ def _judged(source: "ParsedRecording", pairs: list[FlowPair], off: float, fixed:
     T = source.frame_check.T_world_cam
     assert T is not None
     floor = floor_m(pairs)
-    late, best, unshifted = _best_offset(source, pairs)
+    # Between others, poses of other times would fit by chance.
+    late, best, unshifted = _best_offset(source, [p for p in pairs if p.off_m(_fixed(T)) > floor])
     if best < min(_SHIFTED * unshifted, floor) and unshifted - best > _SHIFT_M and not come_again(T):
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)
         return Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, (
@@ -161,7 +164,7 @@ def _best_offset(source: "ParsedRecording", pairs: list[FlowPair]) -> tuple[floa
         T, known = poses_at(poses, clock - late, np.inf)
         mine = np.array([known[list(p.rows)].all() for p in pairs])
         off = np.array([p.off_m(T) for p, is_known in zip(pairs, mine, strict=True) if is_known])
-        if 2 * mine.sum() >= len(pairs) and (off < as_it_is[mine]).sum() >= _MOST * mine.sum():
+        if 2 * mine.sum() >= max(len(pairs), _LEAST_PAIRS) and (off < as_it_is[mine]).sum() >= _MOST * mine.sum():
             found.append((float(off.mean()), late, float(as_it_is[mine].mean())))
     best, late, unshifted = min(found, default=(np.inf, 0.0, np.inf))
     return late, best, unshifted

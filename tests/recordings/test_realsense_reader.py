@@ -115,7 +115,7 @@ def needs_open3d() -> None:
 
 @pytest.mark.slow  # the SDK plays in real time: on a busy machine it drops pictures, and pairs what is left
 def test_the_sdk_reads_its_bag_and_so_do_we(sdk_bag: Path, cache: Path) -> None:
-    """On an idle machine it may drop a frame, but never alters one."""
+    """It may drop a frame, and on a busy machine then pairs color with depth of another; it never alters one."""
     needs_open3d()
     assert find_recordings([sdk_bag.parent]) == [sdk_bag]
     recording = opened(sdk_bag)
@@ -130,7 +130,9 @@ def test_the_sdk_reads_its_bag_and_so_do_we(sdk_bag: Path, cache: Path) -> None:
         t = int(np.argmin(np.abs(truth - frame.depth).mean((1, 2))))
         # The SDK's own registration rounds and fills: the truth is a ramp of 3 and 2 counts per pixel.
         assert np.quantile(np.abs(frame.depth - truth[t]), 0.9) <= 5 * UNIT
-        assert np.abs(np.asarray(frame.rgb, int) - colors(STEPS, SIZE)[t]).mean() < 4, "JPEG, no more"
+        off = [np.abs(np.asarray(frame.rgb, int) - color).mean() for color in colors(STEPS, SIZE).astype(int)]
+        assert min(off) < 4, "JPEG, no more"
+        assert len(recording) < STEPS or off[t] < 4
         seen_t.append(t)
     assert seen_t == sorted(set(seen_t))
 
