@@ -157,6 +157,6 @@ def _lost(folder: Path, frames: int, fps: float) -> tuple[Check, ...]:
     expected = int(length_s * fps)
     if frames >= 0.95 * expected:
         return ()
-    says = (f"{frames} frames came of about {expected} in {length_s:.1f} s; the others were dropped or had no partner, and "
-            "color may be paired with depth a few frames apart: read the bag on an idle machine")  # fmt: skip
+    says = (f"{frames} frames came of about {expected} in {length_s:.1f} s; the others were dropped or had no partner, "
+            "and color may be paired with depth a few frames apart: read the bag on an idle machine")  # fmt: skip
     return (Check("frames", Verdict.DOUBTFUL, says),)
