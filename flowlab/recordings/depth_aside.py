@@ -30,7 +30,7 @@ class DepthAside:
 
     shift: tuple[float, float]
     """By what share of the picture's width and height depth must be moved, right and down."""
-    like: float
+    correlation: float
     """Correlation of the two, if it is moved so."""
     lies: bool | None
     """Whether depth lies on color; None where that is not told."""
@@ -55,8 +55,8 @@ def find_depth_aside(
     seen = np.stack([color_changes(np.stack([color[i].cells for i in pair[:, 0]]))[0] for pair in pairs])
     read = np.stack([depth_changes(np.stack([depth[j].cells for j in pair[:, 1]]))[0] for pair in pairs])
     seen, read = seen - seen.mean(0), read - read.mean(0)
-    whole = _judged(_like_aside(seen, read))
-    if whole.lies and any(_judged(_like_aside(seen[half], read[half])).lies is False for half in _HALVES):
+    whole = _judged(_shifted_correlations(seen, read))
+    if whole.lies and any(_judged(_shifted_correlations(seen[half], read[half])).lies is False for half in _HALVES):
         return replace(whole, lies=None)  # as of a camera with another field of view
     return whole
 
@@ -78,7 +78,7 @@ def _judged(like: Float64[np.ndarray, "n n"]) -> DepthAside:
     return DepthAside((-across / CELLS[1], -down / CELLS[0]), most, lies)
 
 
-def _like_aside(color: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def _shifted_correlations(color: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Correlation of changes with those of depth so many cells down and across, each from -_REACH to _REACH."""
     size = tuple(fft.next_fast_len(n + _REACH, real=True) for n in color.shape[1:])
     spectrum = np.zeros((size[0], size[1] // 2 + 1), complex)

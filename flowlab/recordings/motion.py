@@ -43,7 +43,7 @@ class Offset:
 
     later_s: float
     """0 where they go together."""
-    like: float
+    correlation: float
     """Correlation of the two motions at that offset."""
     without: float
     """The same without it."""
@@ -92,13 +92,13 @@ def check_offset(name: str, offset: Offset | None, key: str, stated: float | Non
     if offset is None:
         return Check(about, Verdict.ASSUMED, "too little motion to tell an offset from color, so it is taken as none")
     if not offset.told:
-        like = f"correlation {offset.like:.2f}, {offset.without:.2f} without one"
+        like = f"correlation {offset.correlation:.2f}, {offset.without:.2f} without one"
         return Check(about, Verdict.ASSUMED, f"tells no offset from color ({like}), so it is taken as none")
     if not offset.later_s:
-        return Check(about, Verdict.OK, f"goes with that of color (correlation {offset.like:.2f})")
+        return Check(about, Verdict.OK, f"goes with that of color (correlation {offset.correlation:.2f})")
     when = "after" if offset.later_s > 0 else "before"
-    says = (f"{abs(offset.later_s):.2f} s {when} that of color (correlation {offset.like:.2f}, {offset.without:.2f} "
-            "without it)")  # fmt: skip
+    says = (f"{abs(offset.later_s):.2f} s {when} that of color (correlation {offset.correlation:.2f}, "
+            f"{offset.without:.2f} without it)")  # fmt: skip
     if offset.periodic:
         says += "; what moves does so periodically, and other offsets fit about as well"
     if stated is not None:

@@ -61,7 +61,7 @@ def _clock(times: list[Float64[np.ndarray, "_"]], step: float) -> Float64[np.nda
     return clock[np.logical_and.reduce(seen)]
 
 
-def alike(one: np.ndarray, other: np.ndarray) -> float:
+def correlation(one: np.ndarray, other: np.ndarray) -> float:
     """Correlation of changes whose means are 0."""
     return float((one * other).sum() / np.sqrt(max(float((one**2).sum()) * float((other**2).sum()), _NOTHING)))
 

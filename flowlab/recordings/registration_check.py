@@ -229,10 +229,13 @@ def _by_changes(aside: DepthAside | None) -> tuple[Verdict, str] | None:
     if aside is None or aside.lies is None:
         return None
     if aside.lies:
-        return Verdict.OK, f", and the pictures agree: depth changes where color does (correlation {aside.like:.2f})"
+        return (
+            Verdict.OK,
+            f", and the pictures agree: depth changes where color does (correlation {aside.correlation:.2f})",
+        )
     right, down = (f"{100 * share:.0f} %" for share in aside.shift)
     return Verdict.DOUBTFUL, (f", but depth changes where color does when moved by {right} of the width and {down} of "
-                              f"the height (correlation {aside.like:.2f})")  # fmt: skip
+                              f"the height (correlation {aside.correlation:.2f})")  # fmt: skip
 
 
 def _turned(source: "ParsedRecording") -> str:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_recordings import write_png, write_yaml
 
-from flowlab.recordings.depth_lag import LAG_CELLS, _like_at_lags, find_depth_lag
+from flowlab.recordings.depth_lag import LAG_CELLS, _lagged_correlations, find_depth_lag
 from flowlab.recordings.motion import Offset
 from flowlab.recordings.picture_changes import find_changes
 
@@ -143,6 +143,6 @@ def test_depth_of_a_camera_of_its_own_is_not_late_for_lying_elsewhere(capsys: Ca
 @settings(max_examples=20, deadline=None)
 def test_correlation_at_lags_is_that_of_the_overlap(seed: int, farthest: int) -> None:
     one, other = np.random.default_rng(seed).normal(size=(2, 23, 4, 5))
-    for lag, like in zip(range(-farthest, farthest + 1), _like_at_lags(one, other, farthest), strict=True):
+    for lag, like in zip(range(-farthest, farthest + 1), _lagged_correlations(one, other, farthest), strict=True):
         a, b = one[max(0, -lag) : 23 - max(0, lag)].ravel(), other[max(0, lag) : 23 - max(0, -lag)].ravel()
         assert like == pytest.approx(a @ b / np.sqrt((a @ a) * (b @ b)), abs=1e-9)
