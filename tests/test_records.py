@@ -170,6 +170,7 @@ def test_every_record_shares_the_checks_and_the_repr() -> None:
 
 
 D = np.ones((12, 16), np.float32)
+RGB = np.zeros((1, 12, 16, 3), np.uint8)
 NOWHERE = np.zeros((2, 3, 2), np.float32)
 SEEN, SURE = np.ones((2, 3), bool), np.ones((2, 3), np.float32)
 
@@ -179,7 +180,9 @@ SEEN, SURE = np.ones((2, 3), bool), np.ones((2, 3), np.float32)
     [
         (lambda e: Frame(np.ma.masked_array(D), CAMERA), r"Frame\.depth is MaskedArray"),
         (lambda e: Frame(D, CAMERA, entities=(1, 2)), r"Frame\.entities is 2 x int, expected a tuple of Entity"),
-        (lambda e: Clip(np.zeros((1, 12, 16, 3), np.uint8), -D[None], CAMERA), r"Clip\.depth is -1 m"),
+        (lambda e: Clip(RGB, -D[None], CAMERA), r"Clip\.depth is -1 m"),
+        (lambda e: Clip(RGB, np.nan * D[None], CAMERA), r"Clip\.depth is nan m .* 0 where nothing is read"),
+        (lambda e: Clip(RGB, np.where(D > 0, np.inf, D)[None], CAMERA), r"Clip\.depth is inf m"),
         (lambda e: replace(e.queries, count=1.5), r"Queries\.count is 1\.5, expected a whole number"),
         (lambda e: replace(e.queries, count="2"), r"Queries\.count is '2', expected a whole number"),
         (lambda e: Observation(np.zeros((2, 3), np.float32), -1), r"Observation\.count is -1, expected 0 to 2"),
