@@ -161,12 +161,10 @@ class Clip(Record):
         return (xyz_world - T[:, None, :3, 3]) @ T[:, :3, :3]
 
     def _check_values(self) -> None:
-        if not self.depth.size:
-            return
-        least, most = self.depth.min(), self.depth.max()
-        if not (least >= 0 and most < np.inf):  # NaN is neither
-            found = most if least >= 0 else least
-            raise self._wrong("depth", f"is {found:g} m at some pixel, expected 0 or more, and 0 where nothing is read")
+        ends = (self.depth.min(), self.depth.max()) if self.depth.size else ()
+        for found in ends:
+            if not 0 <= found < np.inf:  # as NaN is, too
+                raise self._wrong("depth", f"is {found:g} m somewhere, expected 0 or more, and 0 where nothing is read")
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -55,7 +55,7 @@ def test_depth_that_lies_aside_is_found_where_it_changes(
 
 
 @given(seed=st.integers(0, 1000), right=st.integers(-6, 6), down=st.integers(-6, 6))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_where_depth_lies_is_told_to_within_a_cell(seed: int, right: int, down: int) -> None:
     color, depth = pictures(seed)
     found = aside_of(color, np.roll(depth, (5 * down, 5 * right), (1, 2)))

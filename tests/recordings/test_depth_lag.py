@@ -83,7 +83,7 @@ def offset_of(color: np.ndarray, depth: np.ndarray, color_s: np.ndarray, depth_s
 
 
 @given(seed=st.integers(0, 10_000), late=st.integers(-4, 4), rate=st.sampled_from([1, 2]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_streams_of_other_rates_are_compared_on_one_clock(seed: int, late: int, rate: int) -> None:
     rng = np.random.default_rng(seed)
     path = np.add(np.cumsum(rng.normal(0, 1.2, (90, 2)), axis=0), (12, 16))
@@ -140,7 +140,7 @@ def test_depth_of_a_camera_of_its_own_is_not_late_for_lying_elsewhere(capsys: Ca
 
 
 @given(seed=st.integers(0, 10_000), farthest=st.integers(1, 7))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_correlation_at_lags_is_that_of_the_overlap(seed: int, farthest: int) -> None:
     one, other = np.random.default_rng(seed).normal(size=(2, 23, 4, 5))
     for lag, like in zip(range(-farthest, farthest + 1), _lagged_correlations(one, other, farthest), strict=True):

@@ -238,7 +238,6 @@ LATE = np.stack([pose(t - 0.3) for t in CLOCK])
         (LATE, "refused", "-0.3 s were added .* write 'T_world_cam_offset_s: -0.3'"),
         (np.stack([pose(t + 0.1) for t in CLOCK]), "doubtful", "0.1 s were added"),
         (scaled(POSES, 0.7), "refused", r"moved 1\.4\d times as far: poses are in another unit or of no known scale"),
-        (scaled(POSES, 1.5), "refused", r"moved 0\.6\d times as far"),
         (scaled(POSES, 0.87), "doubtful", r"moved 1\.1\d times as far"),
         (POSES[::-1].copy(), "refused", "explain too little|must be those of the color camera itself"),
         (POSES @ looking((0.1, -0.2, 0.05)), "refused", "not of a flange"),
@@ -281,7 +280,7 @@ def test_true_poses_are_not_refused_for_a_hand_that_fills_the_picture(tmp_path: 
     assert (code, found["camera"][0]) in ((0, "ok"), (0, "doubtful")), problem
 
 
-@pytest.mark.parametrize(("T", "verdict"), [(POSES, "ok"), (scaled(POSES, 0.7), "refused"), (lost(3, 11), "doubtful")])
+@pytest.mark.parametrize(("T", "verdict"), [(POSES, "ok"), (scaled(POSES, 0.7), "refused")])
 def test_a_gripper_before_a_camera_at_the_wrist_says_nothing_of_its_poses(
     frames: Frames, tmp_path: Path, capsys: Capture, T: np.ndarray, verdict: str
 ) -> None:
