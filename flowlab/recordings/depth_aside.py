@@ -19,7 +19,8 @@ _LIKE = 0.1
 _AWAY, _OF_LIKE = 1.9, 0.9
 """Where the best of all places is so many cells away, and they are less alike here than this share of there, depth does
 not lie on color; where it is not away at all, it does."""
-_HALVES = (np.s_[:, :, :32], np.s_[:, :, 32:], np.s_[:, :24], np.s_[:, 24:])
+_MIDDLE = (CELLS[0] // 2, CELLS[1] // 2)
+_HALVES = (np.s_[:, :, : _MIDDLE[1]], np.s_[:, :, _MIDDLE[1] :], np.s_[:, : _MIDDLE[0]], np.s_[:, _MIDDLE[0] :])
 """Of the cells: left, right, upper, lower."""
 _NOTHING = 1e-12
 

@@ -11,6 +11,8 @@ from flowlab.recordings.content import PictureDigest
 from flowlab.recordings.motion import FEWEST
 from flowlab.recordings.sync import nearest_sample
 
+_CELLS = (24, 32)
+"""Rows and columns of cells in which changes over time are compared."""
 _GRAY, _OF_DEPTH = 40.0, 0.05
 """So many gray levels, and so much of the depth, are the greatest change that counts: something came, or went."""
 _NOTHING = 1e-12
@@ -27,7 +29,7 @@ class PictureChanges:
 
 
 def find_changes(
-    streams: Streams, color: Mapping[int, PictureDigest], depth: Mapping[int, PictureDigest], cells: tuple[int, int]
+    streams: Streams, color: Mapping[int, PictureDigest], depth: Mapping[int, PictureDigest]
 ) -> PictureChanges | None:
     """Where color and depth change; None where there are too few pictures.
 
@@ -35,7 +37,6 @@ def find_changes(
         streams: The recording.
         color: What is kept of color pictures, by index.
         depth: Likewise of depth pictures.
-        cells: Rows and columns of cells in which changes are told.
     """
     times = [stream.time_s[sorted(kept)] for stream, kept in ((streams.color, color), (streams.depth, depth))]
     if min(map(len, times)) <= FEWEST:
@@ -45,7 +46,7 @@ def find_changes(
     clock = _clock(middle, step)
     if len(clock) < FEWEST:
         return None
-    seen, read = color_changes(_thinned(color, cells)), depth_changes(_thinned(depth, cells))
+    seen, read = color_changes(_thinned(color)), depth_changes(_thinned(depth))
     return PictureChanges(_on(clock, middle[0], seen), _on(clock, middle[1], read), step)
 
 
@@ -79,12 +80,12 @@ def depth_changes(counts: Num[np.ndarray, "T h w"]) -> Float32[np.ndarray, "N h 
     return np.where((before > 0) & (after > 0), np.minimum(share / _OF_DEPTH, 1), 0).astype(np.float32)
 
 
-def _thinned(digests: Mapping[int, PictureDigest], cells: tuple[int, int]) -> Float32[np.ndarray, "T h w"]:
+def _thinned(digests: Mapping[int, PictureDigest]) -> Float32[np.ndarray, "T h w"]:
     """Pictures in order, of so many cells."""
     small = [digests[k].small for k in sorted(digests)]
     shape = small[0].shape
-    rows, columns = (np.linspace(0, n - 1, m).round().astype(int) for n, m in zip(shape, cells, strict=True))
-    thin = [s[np.ix_(rows, columns)] if s.shape == shape else np.zeros(cells) for s in small]
+    rows, columns = (np.linspace(0, n - 1, m).round().astype(int) for n, m in zip(shape, _CELLS, strict=True))
+    thin = [s[np.ix_(rows, columns)] if s.shape == shape else np.zeros(_CELLS) for s in small]
     return np.stack(thin).astype(np.float32)
 
 

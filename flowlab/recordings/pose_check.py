@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 from flowlab.geometry.transforms import rigid
 from flowlab.recordings.pose_pairs import FlowPair, floor_m, flow_pairs
@@ -52,20 +52,20 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     if not pairs:
         says = "it moves as its poses say; too little texture and depth in the pictures to tell whether these are right"
         return Check("camera", Verdict.ASSUMED, says)
-    off, fixed = _off_m(pairs, T), _off_m(pairs, _fixed(T))
+    off, fixed = _off_m(pairs, T), float(np.median([np.median(p.moved_m()) for p in pairs]))
     seen = (f"under its poses the scene stays within {1000 * off:.1f} mm in the median between {len(pairs)} pairs of "
             f"pictures, and would move by {1000 * fixed:.1f} mm before a camera that stands still")  # fmt: skip
-    verdict, says = _judged(source, pairs, off, fixed)
+    verdict, says = _judged(source, pairs, T, off, fixed)
     return Check("camera", verdict, f"it moves{says}: {seen}" if verdict is Verdict.OK else f"{seen}{says}")
 
 
-def _judged(source: "ParsedRecording", pairs: list[FlowPair], off: float, fixed: float) -> tuple[Verdict, str]:
-    """What follows from how far apart points are under the poses, and would be without [m]."""
-    T = source.frame_check.T_world_cam
-    assert T is not None
+def _judged(
+    source: "ParsedRecording", pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: float, fixed: float
+) -> tuple[Verdict, str]:
+    """What follows from how far apart points are under the poses T, and would be without [m]."""
     floor = floor_m(pairs)
     # Between others, poses of other times would fit by chance.
-    late, best, unshifted = _best_offset(source, [p for p in pairs if p.off_m(_fixed(T)) > floor])
+    late, best, unshifted = _best_offset(source, [p for p in pairs if np.median(p.moved_m()) > floor])
     if best < min(_SHIFTED * unshifted, floor) and unshifted - best > _SHIFT_M and not come_again(T):
         write = late + (source.metadata.T_world_cam_offset_s or 0.0)
         return Verdict.REFUSED if off > floor else Verdict.DOUBTFUL, (
@@ -85,7 +85,7 @@ def _judged(source: "ParsedRecording", pairs: list[FlowPair], off: float, fixed:
         return wrong
     contradicted = [p for p in pairs if _contradicts(p, T, floor)]
     if 0 < len(contradicted) < _MOST * len(pairs):
-        return _judged_in_part(source, contradicted, len(pairs))
+        return _judged_in_part(source, contradicted, len(pairs), T)
     if fits:
         told = off <= _EXPLAINED * fixed or fixed <= floor / 2
         return (Verdict.OK, " little" if little else "") if told else (Verdict.ASSUMED, (
@@ -114,25 +114,25 @@ def _judged_scale(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: flo
 def _contradicts(pair: FlowPair, T: Float[np.ndarray, "T 4 4"], floor: float) -> bool:
     """Whether poses explain little of how far the scene moves: neither most of it nor, as where something that moves
     fills the picture, some."""
-    off, fixed = pair.off_m(T), pair.off_m(_fixed(T))
+    off, fixed = pair.off_m(T), float(np.median(pair.moved_m()))
     return off > max(_ERRS * floor, _EXPLAINED * fixed) and pair.off_m(T, _SOME) > floor
 
 
 def _some_stays(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], floor: float) -> bool:
     """Whether in most pairs some points stay that would move before a camera that stands still: then it may be that
     something that moves fills most of the picture."""
-    shares = [((p.apart_m(T) <= floor) & (p.apart_m(_fixed(T)) > 2 * floor)).mean() for p in pairs]
+    shares = [((p.apart_m(T) <= floor) & (p.moved_m() > 2 * floor)).mean() for p in pairs]
     return bool(np.median(shares) >= _SOME)
 
 
-def _judged_in_part(source: "ParsedRecording", contradicted: list[FlowPair], count: int) -> tuple[Verdict, str]:
+def _judged_in_part(
+    source: "ParsedRecording", contradicted: list[FlowPair], count: int, T: Float[np.ndarray, "T 4 4"]
+) -> tuple[Verdict, str]:
     """What follows where the scene stays under the poses between most of ``count`` pairs of pictures, not between some:
     a camera whose tracking was lost for a while."""
-    T = source.frame_check.T_world_cam
-    assert T is not None
     worst = max(contradicted, key=lambda p: p.off_m(T))
     first, second = (source.streams.color.names[int(source.frame_check.color[r])] for r in worst.rows)
-    lost = sum(p.off_m(T) >= _NO_BETTER * p.off_m(_fixed(T)) for p in contradicted)
+    lost = sum(p.off_m(T) >= _NO_BETTER * np.median(p.moved_m()) for p in contradicted)
     many = lost >= max(2, _SOME_PAIRS * count)
     return Verdict.REFUSED if many else Verdict.DOUBTFUL, (
         f", but not between {len(contradicted)} of them, by {1000 * worst.off_m(T):.1f} mm from {first} to {second}: "
@@ -143,11 +143,6 @@ def _judged_in_part(source: "ParsedRecording", contradicted: list[FlowPair], cou
 def _off_m(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"]) -> float:
     """How far apart points are that should be one, in most of the pairs."""
     return float(np.median([p.off_m(T) for p in pairs]))
-
-
-def _fixed(T: Float[np.ndarray, "T 4 4"]) -> Float64[np.ndarray, "T 4 4"]:
-    """As many poses of a camera that stands still."""
-    return np.tile(np.eye(4), (len(T), 1, 1))
 
 
 def _best_offset(source: "ParsedRecording", pairs: list[FlowPair]) -> tuple[float, float, float]:

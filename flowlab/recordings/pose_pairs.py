@@ -74,6 +74,10 @@ class FlowPair:
             inside = left <= np.median(left)
         return bool(np.median(left) < off_m)
 
+    def moved_m(self) -> Float64[np.ndarray, "N"]:
+        """How far they move before the camera [m]."""
+        return np.asarray(np.linalg.norm(self.first - self.second, axis=1))
+
     def apart_m(self, T: Float[np.ndarray, "T 4 4"]) -> Float64[np.ndarray, "N"]:
         """How far apart they are in the world under poses [m]."""
         a, b = (apply(T[r], p) for r, p in zip(self.rows, (self.first, self.second), strict=True))
@@ -88,7 +92,8 @@ class FlowPair:
         a camera at the wrist; all of it where little else is left."""
         first, second = self.rows
         places = [
-            p[:, :2] / p[:, 2:] for p in (self.first, self.second, apply(inverse(T[second]) @ T[first], self.first))
+            p[:, :2] / np.maximum(p[:, 2:], 1e-3)
+            for p in (self.first, self.second, apply(inverse(T[second]) @ T[first], self.first))
         ]
         seen, said = (np.linalg.norm(there - places[0], axis=1) / self.pixel_rad for there in places[1:])
         rest = ~((seen < _STAYS_PX) & (said > _MOVES_PX))

@@ -7,7 +7,7 @@ import numpy as np
 
 from flowlab.recordings.base import ImageStream, Streams
 from flowlab.recordings.content import PictureDigest, change_between
-from flowlab.recordings.depth_lag import LAG_CELLS, LEAST_CORRELATION, find_depth_lag
+from flowlab.recordings.depth_lag import LEAST_CORRELATION, find_depth_lag
 from flowlab.recordings.motion import Motion, check_offset, find_offset
 from flowlab.recordings.picture_changes import find_changes
 from flowlab.recordings.verdicts import Check
@@ -33,7 +33,7 @@ def check_offsets(
     if len(color) < 2 or len(depth) < 2:
         return ()
     pictures = _motion_of("color", streams.color, color)
-    changes = find_changes(streams, color, depth, LAG_CELLS) if aligned else None
+    changes = find_changes(streams, color, depth) if aligned else None
     lag = None if changes is None else find_depth_lag(changes)
     if lag is None or lag.correlation < LEAST_CORRELATION:
         lag = find_offset(pictures, _motion_of("depth", streams.depth, depth))

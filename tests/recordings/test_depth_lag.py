@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_recordings import write_png, write_yaml
 
-from flowlab.recordings.depth_lag import LAG_CELLS, _lagged_correlations, find_depth_lag
+from flowlab.recordings.depth_lag import _lagged_correlations, find_depth_lag
 from flowlab.recordings.motion import Offset
 from flowlab.recordings.picture_changes import find_changes
 
@@ -78,7 +78,7 @@ def test_an_offset_that_is_written_is_applied(
 def offset_of(color: np.ndarray, depth: np.ndarray, color_s: np.ndarray, depth_s: np.ndarray) -> Offset | None:
     streams = SimpleNamespace(color=SimpleNamespace(time_s=color_s), depth=SimpleNamespace(time_s=depth_s))
     kept = [{k: SimpleNamespace(small=x) for k, x in enumerate(pictures)} for pictures in (color, depth)]
-    changes = find_changes(streams, *kept, LAG_CELLS)  # type: ignore[arg-type]
+    changes = find_changes(streams, *kept)  # type: ignore[arg-type]
     return None if changes is None else find_depth_lag(changes)
 
 
@@ -118,7 +118,7 @@ def test_a_pause_of_a_day_takes_no_room() -> None:
     clock = np.r_[np.arange(30) / 10, 86_400 + np.arange(30) / 10]
     stream = SimpleNamespace(time_s=clock)
     kept = [{k: SimpleNamespace(small=np.zeros((24, 32))) for k in range(60)} for _ in "cd"]
-    changes = find_changes(SimpleNamespace(color=stream, depth=stream), *kept, LAG_CELLS)  # type: ignore[arg-type]
+    changes = find_changes(SimpleNamespace(color=stream, depth=stream), *kept)  # type: ignore[arg-type]
     assert changes is not None
     assert 50 < len(changes.color) < 70
 
