@@ -11,6 +11,7 @@ from flowlab.recordings.base import BadImage, ImageStream, SampleStream, Streams
 from flowlab.recordings.content import PictureDigest, digest, repeated_pictures
 from flowlab.recordings.depth_aside import DepthAside, find_depth_aside
 from flowlab.recordings.frame_processing import Size
+from flowlab.recordings.picture_order import check_order
 from flowlab.recordings.picture_samples import PictureSample, chosen, shrink_factor, small_depth, small_gray
 from flowlab.recordings.pose_steps import check_steps
 from flowlab.recordings.poses import check_known, poses_at
@@ -140,7 +141,8 @@ def check_frames(
     state = align_samples(streams.state, streams.color.time_s[rows[:, 0]], nearest_sample)
     frozen, repeats = find_repeats(streams, digests[0], digests[1], rows, state, rendered=rendered)
     told = [{i: d for i, d in kept.items() if i not in rows[list(frozen), which]} for which, kept in enumerate(digests)]
-    checks = (repeats, *check_offsets(streams, told[0], told[1], stated or {}, aligned=aligned))
+    in_order = check_order(*([kept[int(i)] for i in rows[:, k]] for k, kept in enumerate(digests)))
+    checks = (repeats, in_order, *check_offsets(streams, told[0], told[1], stated or {}, aligned=aligned))
     bad += [BadFrame(streams.color.names[rows[k, 0]], reason) for k, reason in frozen.items()]
     skipped += [int(rows[k, 0]) for k in frozen]
     rows = np.delete(rows, list(frozen), axis=0)

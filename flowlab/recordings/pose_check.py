@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from flowlab.geometry.transforms import rigid
+from flowlab.recordings.hand_eye import estimate_hand_eye
 from flowlab.recordings.pose_pairs import FlowPair, floor_m, flow_pairs
 from flowlab.recordings.pose_readings import READINGS
 from flowlab.recordings.pose_scale import estimate_scale, scaled
@@ -36,6 +37,10 @@ _LEAST_PAIRS = 4
 """Poses at other times are tried on half as many pairs at least."""
 _SHIFT_M = 0.003
 """And by no less than this [m]."""
+_MUST_BE = (
+    "the poses must be those of the color camera itself (x right, y down, z forward), not of a flange or another "
+    "camera, in meters, on the clock of the pictures ('T_world_cam_offset_s')"
+)
 _OFFSETS_S = tuple(float(x) for x in np.arange(-10, 11) * 0.05 if x)
 _READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     **READINGS,
@@ -48,7 +53,7 @@ def check_poses_fit(source: "ParsedRecording") -> Check:
     T = source.frame_check.T_world_cam
     assert T is not None
     found = [pair.without_carried(T) for pair in flow_pairs(source)]
-    pairs = [pair for pair in found if pair.is_rigid(floor_m([pair]))]
+    pairs = [pair for pair in found if pair.fit().left_m < floor_m([pair])]
     if not pairs:
         says = "it moves as its poses say; too little texture and depth in the pictures to tell whether these are right"
         return Check("camera", Verdict.ASSUMED, says)
@@ -81,31 +86,60 @@ def _judged(
         return Verdict.REFUSED, (
             f", within {1000 * others[how]:.1f} mm if each were {how}: T_world_cam must map coordinates of the camera "
             "(x right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
-    if (wrong := _judged_scale(pairs, T, off)) is not None:
-        return wrong
+    explained, taken = _judged_explained(pairs, T, off), _judged_as_taken(source, pairs, T, off, fixed, fits=fits)
+    return taken if explained is None or taken[0].severity > explained[0].severity else explained
+
+
+def _judged_as_taken(
+    source: "ParsedRecording", pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: float, fixed: float, *,
+    fits: bool,
+) -> tuple[Verdict, str]:  # fmt: skip
+    """What follows where no other reading of the poses is any better."""
+    floor = floor_m(pairs)
     contradicted = [p for p in pairs if _contradicts(p, T, floor)]
     if 0 < len(contradicted) < _MOST * len(pairs):
         return _judged_in_part(source, contradicted, len(pairs), T)
     if fits:
-        told = off <= _EXPLAINED * fixed or fixed <= floor / 2
+        told, little = off <= _EXPLAINED * fixed or fixed <= floor / 2, fixed <= 2 * floor
         return (Verdict.OK, " little" if little else "") if told else (Verdict.ASSUMED, (
             ": that is too little to tell whether the poses are right"))  # fmt: skip
     worse = off > _EXPLAINED * fixed
     why = "they explain too little of it" if worse else "that is more than sensors err by"
     refused = worse and off > _ERRS * floor and not _some_stays(pairs, T, floor)
-    return Verdict.REFUSED if refused else Verdict.DOUBTFUL, (
-        f": {why}; the poses must be those of the color camera itself (x right, y down, z forward), not of a flange or "
-        "another camera, in meters, on the clock of the pictures ('T_world_cam_offset_s')")  # fmt: skip
+    return Verdict.REFUSED if refused else Verdict.DOUBTFUL, f": {why}; {_MUST_BE}"
 
 
-def _judged_scale(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: float) -> tuple[Verdict, str] | None:
+def _judged_explained(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: float) -> tuple[Verdict, str] | None:
+    """What follows where the poses of something else, or scaled, would explain what is seen: by what does so best."""
+    found = [x for x in (_judged_hand(pairs, T), _judged_scale(pairs, T, off)) if x is not None]
+    return min(found)[1:] if found else None
+
+
+_Explained = tuple[float, Verdict, str]
+"""Within what the scene stays then [m], and what follows."""
+
+
+def _judged_hand(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"]) -> _Explained | None:
+    """What follows where poses are those of what the camera is mounted on."""
+    mounted = estimate_hand_eye(pairs, T)
+    if mounted is None:
+        return None
+    T_world_cam = T @ mounted.T_hand_cam
+    off, then = (np.array([p.off_m(poses) for p in pairs]) for poses in (T, T_world_cam))
+    verdict, best = mounted.judged(off, then), float(np.median(then))
+    return None if verdict is Verdict.OK else (best, verdict, (
+        f", within {1000 * best:.1f} mm if they were of a hand on which the camera is turned by "
+        f"{np.degrees(mounted.turn_rad):.0f} degrees and {1000 * mounted.away_m:.0f} mm away; {_MUST_BE}"))  # fmt: skip
+
+
+def _judged_scale(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"], off: float) -> _Explained | None:
     """What follows where the camera moves farther, or less far, by its pictures than by its poses."""
     scale = estimate_scale(pairs, T)
     if scale is None or scale.share <= 0:
         return None
     best = _off_m(pairs, scaled(T, scale.share))
     verdict = scale.judged(best / max(off, 1e-9))
-    return None if verdict is Verdict.OK else (verdict, (
+    return None if verdict is Verdict.OK else (best, verdict, (
         f", within {1000 * best:.1f} mm if the camera had moved {scale.share:.2f} times as far: poses are in another "
         "unit or of no known scale, as of SLAM with one camera, or 'depth_unit_m' or the focal length is wrong; "
         "correct which it is"))  # fmt: skip

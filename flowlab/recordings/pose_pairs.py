@@ -45,6 +45,24 @@ _REFITS = 4
 
 
 @dataclass(frozen=True, slots=True)
+class RigidFit:
+    """How a camera sees a scene move from one row to another."""
+
+    R: Float64[np.ndarray, "3 3"]
+    t: Float64[np.ndarray, "3"]
+    left_m: float
+    """How far points are from it, in the median; far where they were not found again."""
+
+
+def rotation_between(
+    first: Float64[np.ndarray, "N 3"], second: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """The rotation that takes vectors to others as well as one can (Kabsch)."""
+    U, _, Vt = np.linalg.svd(first.T @ second)
+    return np.asarray(Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T)
+
+
+@dataclass(frozen=True, slots=True)
 class FlowPair:
     """Points that two rows show, each in the camera frame of its row [m]."""
 
@@ -63,16 +81,16 @@ class FlowPair:
         """How wide a pixel is at every point, by how far apart points are that are as far apart in the picture [m]."""
         return self.first[:, 2] * self.pixel_rad
 
-    def is_rigid(self, off_m: float) -> bool:
-        """Whether some rigid motion takes most points to within so much; if none does, they were not found again."""
+    def fit(self) -> "RigidFit":
+        """The rigid motion that takes most points of the first row to the second."""
         inside = np.ones(len(self.first), bool)
         for _ in range(_REFITS):
             a, b = self.first[inside], self.second[inside]
-            U, _, Vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
-            R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-            left = np.linalg.norm((self.first - a.mean(0)) @ R.T + b.mean(0) - self.second, axis=1)
+            R = rotation_between(a - a.mean(0), b - b.mean(0))
+            t = b.mean(0) - R @ a.mean(0)
+            left = np.linalg.norm(self.first @ R.T + t - self.second, axis=1)
             inside = left <= np.median(left)
-        return bool(np.median(left) < off_m)
+        return RigidFit(R, t, float(np.median(left)))
 
     def moved_m(self) -> Float64[np.ndarray, "N"]:
         """How far they move before the camera [m]."""

@@ -19,7 +19,7 @@ from test_ros_reader import Messages, Say, instant, write_bag
 
 import flowlab
 from flowlab.geometry.camera import Camera
-from flowlab.geometry.transforms import inverse
+from flowlab.geometry.transforms import inverse, rigid
 from flowlab.recordings.parsing import RecordingSettings, parse_recording
 from flowlab.recordings.pose_scale import scaled
 from flowlab.recordings.preview import preview_recording
@@ -223,6 +223,13 @@ OPENGL = np.diag([1.0, -1, -1, 1])
 BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 MILLIMETERS = POSES.copy()
 MILLIMETERS[:, :3, 3] *= 1000
+
+
+def on_a_flange(degrees: float) -> np.ndarray:
+    """From the frame of a flange to that of a camera that is mounted on it."""
+    return rigid(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.array([0.0, 0.03, -0.06]))
+
+
 LATE = np.stack([pose(t - 0.3) for t in CLOCK])
 
 
@@ -241,6 +248,8 @@ LATE = np.stack([pose(t - 0.3) for t in CLOCK])
         (scaled(POSES, 0.87), "doubtful", r"moved 1\.1\d times as far"),
         (POSES[::-1].copy(), "refused", "explain too little|must be those of the color camera itself"),
         (POSES @ looking((0.1, -0.2, 0.05)), "refused", "not of a flange"),
+        (POSES @ on_a_flange(30), "refused", r"on which the camera is turned by (29|30|31) degrees and [67]. mm away"),
+        (POSES @ on_a_flange(8), "refused", r"turned by [789] degrees and [67]. mm away"),
         (np.tile(POSES[:1], (len(POSES), 1, 1)), "refused", "explain too little"),
     ],
 )  # fmt: skip

@@ -1,0 +1,78 @@
+"""Where a camera is mounted on what its poses are of, as on a hand: told by how both move."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+
+from flowlab.geometry.transforms import inverse, rigid
+from flowlab.recordings.pose_pairs import FlowPair, rotation_between
+from flowlab.recordings.verdicts import Verdict
+
+_LEAST_PAIRS = 4
+"""Fewer pairs of pictures tell nothing."""
+_ELSEWHERE, _FAR_ELSEWHERE = (float(np.radians(5.0)), 0.02), (float(np.radians(10.0)), 0.05)
+"""A camera that is turned [rad] and away [m] by less may as well be what its poses are of; by more it surely is not."""
+_BETTER, _MOST = (0.7, 0.5), 0.85
+"""Poses are doubtful, and wrong, if the scene stays within this share of what it did where they are taken for the
+hand's, and is better in so many of the pairs. (Of 73 films with true poses none is, with 2 mm and 0.5 degrees of noise
+none; where the camera is turned by 20 degrees 62 are.)"""
+_ROUNDS = 4
+_RIDGE = 1e-3
+"""Keeps the camera at the hand where nothing tells how far away it is: a hand that does not turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class HandEye:
+    """Where a camera is on what its poses are of."""
+
+    T_hand_cam: Float64[np.ndarray, "4 4"]
+
+    @property
+    def turn_rad(self) -> float:
+        """By how much it is turned."""
+        return float(Rotation.from_matrix(self.T_hand_cam[:3, :3]).magnitude())
+
+    @property
+    def away_m(self) -> float:
+        """How far away it is."""
+        return float(np.linalg.norm(self.T_hand_cam[:3, 3]))
+
+    def judged(self, off_m: Float64[np.ndarray, "P"], mounted_m: Float64[np.ndarray, "P"]) -> Verdict:
+        """What follows from within what the scene stays, in each pair, as it is and with poses taken for the hand's."""
+        better = float(np.median(mounted_m) / max(np.median(off_m), 1e-9))
+        is_hand, is_near = (self.turn_rad < turn and self.away_m < away for turn, away in (_ELSEWHERE, _FAR_ELSEWHERE))
+        if is_hand or better > _BETTER[0] or (mounted_m < off_m).mean() < _MOST:
+            return Verdict.OK
+        return Verdict.DOUBTFUL if is_near or better > _BETTER[1] else Verdict.REFUSED
+
+
+def estimate_hand_eye(pairs: Sequence[FlowPair], T_world_hand: Float[np.ndarray, "T 4 4"]) -> HandEye | None:
+    """Where a camera is on a hand, from how the hand moves by poses and the scene by pictures; None of too few pairs.
+
+    Rotations about axes and steps along directions are turned alike between the two frames; what the hand's own turns
+    move the camera is then told by how far away it is, and taken from the steps.
+
+    Args:
+        pairs: Points that two rows show.
+        T_world_hand: The pose of every row.
+    """
+    if len(pairs) < _LEAST_PAIRS:
+        return None
+    far = float(np.median([np.median(p.first[:, 2]) for p in pairs]))
+    said = np.stack([inverse(T_world_hand[p.rows[1]]) @ T_world_hand[p.rows[0]] for p in pairs])
+    fits = [p.fit() for p in pairs]
+    steps = np.stack([f.t for f in fits])
+    turns_hand, turns_cam = (far * Rotation.from_matrix(R).as_rotvec() for R in
+                             (said[:, :3, :3], np.stack([f.R for f in fits])))  # fmt: skip
+    turned = np.eye(3) - said[:, :3, :3]
+    t = np.zeros(3)
+    for _ in range(_ROUNDS):
+        R = rotation_between(
+            np.concatenate([turns_cam, steps]), np.concatenate([turns_hand, said[:, :3, 3] - turned @ t])
+        )
+        M, rest = turned.reshape(-1, 3), (said[:, :3, 3] - steps @ R.T).ravel()
+        t = np.linalg.solve(M.T @ M + _RIDGE * len(pairs) * np.eye(3), M.T @ rest)
+    return HandEye(rigid(R, t))

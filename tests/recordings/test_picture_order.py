@@ -1,0 +1,56 @@
+"""Pictures whose files are not in the order in which they were taken, though their times rise."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dry_runs import dry_run
+from test_situations_repeats import film, write
+
+from flowlab.recordings.picture_order import ABOUT
+
+FRAMES = 48
+IN_ORDER = list(range(FRAMES))
+AT_RANDOM = np.random.default_rng(0).permutation(FRAMES).tolist()
+THERE_AND_BACK = [abs((5 * k) % 78 - 39) for k in IN_ORDER]
+
+
+def as_text(first: int = 0, step: int = 1) -> list[int]:
+    return sorted(IN_ORDER, key=lambda k: str(first + step * k))
+
+
+@pytest.mark.parametrize("pan", [0.0, 2.0], ids=["camera stands", "camera moves"])
+@pytest.mark.parametrize(
+    ("color", "depth", "verdict", "says"),
+    [
+        (IN_ORDER, IN_ORDER, "ok", "look most like those beside them"),
+        (THERE_AND_BACK, THERE_AND_BACK, "ok", "look most like"),
+        (
+            as_text(),
+            as_text(),
+            "refused",
+            r"color: .* numbers as text \(0, 1, 10, 11, ...\).*depth: .*sort in the order",
+        ),
+        (as_text(1), as_text(1), "refused", r"numbers as text \(1, 10, 11, 12, ...\)"),
+        (as_text(0, 5), as_text(0, 5), "refused", r"numbers as text \(0, 10, 100, 105, ...\)"),
+        (IN_ORDER, as_text(), "refused", "^depth: the pictures seem"),
+        (AT_RANDOM, AT_RANDOM, "refused", "color: the pictures seem to be in no order: the next"),
+    ],
+    ids=["in order", "there and back", "as text", "from 1", "by fives", "depth alone", "at random"],
+)
+def test_pictures_out_of_order_are_told(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, pan: float, color: Sequence[int], depth: Sequence[int],
+    verdict: str, says: str,
+) -> None:  # fmt: skip
+    frames = [(film(c, pan=pan)[0], film(d, pan=pan)[1]) for c, d in zip(color, depth, strict=True)]
+    run = dry_run(capsys, write(tmp_path / "r", frames))
+    found, words = run.checks[ABOUT]
+    assert found == verdict, words
+    assert re.search(says, words), words
+
+
+def test_few_rows_do_not_tell_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = dry_run(capsys, write(tmp_path / "r", [film(t) for t in range(12)]))
+    assert run.checks[ABOUT] == ("assumed", "12 rows are too few to tell it, so it is taken as it is")
