@@ -8,29 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from flowlab.errors import UsageError
-from flowlab.grading.scenes.motions import (
-    Motion,
-    Path,
-    carried,
-    leave,
-    lift,
-    progress,
-    push,
-    rest,
-    shifted,
-    slide,
-    spin,
-    still,
-    turned,
-)
+from flowlab.grading.scenes.loose_things import clutter, flat, large, plain, rolling, swarm, tabletop, thin
+from flowlab.grading.scenes.motions import Path, carried, lift, progress, rest, shifted, slide, spin, still, turned
+from flowlab.grading.scenes.placing import PATTERNED, add, bending, is_free, pick, random_look
 from flowlab.grading.scenes.textures import Look
-from flowlab.grading.scenes.things import Solid, Thing, cup, finger, hand, joined, place, random_solid, strip
+from flowlab.grading.scenes.things import Solid, Thing, cup, finger, hand, joined, place
 from flowlab.records import Role
 
 FIRST_REPORTED_SEED = 1000
 """Seeds below are for making trackers and calibrating what they state, seeds from here on for reporting."""
-_TRIES = 60
-_PATTERNED: tuple[Look, ...] = ("textured", "textured", "striped", "mirrored", "plain")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,104 +30,14 @@ class Family:
     """Its things, of so many frames."""
     held_out: bool = False
     """Whether it is never used for making or calibrating a tracker, so that it tells what becomes of unknown scenes."""
-    looks: tuple[Look, ...] = _PATTERNED
+    looks: tuple[Look, ...] = PATTERNED
     """Of table and walls."""
-
-
-def _free(things: Sequence[Thing], candidate: Thing) -> bool:
-    """Whether a thing never comes so near another that they could pass through each other."""
-    for other in things:
-        apart = np.linalg.norm(candidate.path[:, :3, 3] - other.path[:, :3, 3], axis=-1)
-        if apart.min() < candidate.reach + other.reach:
-            return False
-    return True
-
-
-def _add(
-    things: list[Thing],
-    rng: np.random.Generator,
-    steps: int,
-    motion: Motion,
-    make: Callable[[], tuple[Solid, ...]],
-    spread_m: float = 0.28,
-) -> None:
-    """Put a thing on the table where it and its motion have room; where there is none, it is left out."""
-    for _ in range(_TRIES):
-        solids = make()
-        x, y = rng.uniform(-spread_m, spread_m, 2)
-        height = max(_height(s) for s in solids)
-        start = place(x, y, height, angles=(0, 0, rng.uniform(-np.pi, np.pi)))
-        thing = Thing(f"thing {len(things)}", solids, motion(still(start, steps), rng))
-        if _free(things, thing):
-            things.append(thing)
-            return
-
-
-def _height(solid: Solid) -> float:
-    """How high the thing's center must lie for the solid to rest on the table [m]."""
-    corners = np.array(np.meshgrid(*[(-s, s) for s in solid.size])).reshape(3, -1)
-    return float(-(solid.at[:3, :3] @ corners)[2].min() - solid.at[2, 3])
-
-
-def _look(rng: np.random.Generator) -> Look:
-    return _PATTERNED[int(rng.integers(len(_PATTERNED)))]
-
-
-def _pick(rng: np.random.Generator, motions: Sequence[Motion]) -> Motion:
-    return motions[int(rng.integers(len(motions)))]
-
-
-def _tabletop(rng: np.random.Generator, steps: int) -> list[Thing]:
-    things: list[Thing] = []
-    for _ in range(rng.integers(1, 6)):
-        _add(things, rng, steps, _pick(rng, (slide, push, spin, lift)), lambda: joined(rng, _look(rng)))
-    for _ in range(rng.integers(0, 3)):
-        _add(things, rng, steps, rest, lambda: joined(rng, _look(rng)))
-    return things
-
-
-def _clutter(rng: np.random.Generator, steps: int) -> list[Thing]:
-    things: list[Thing] = []
-    for motion in (leave, push, lift, slide, spin)[: rng.integers(2, 6)]:
-        _add(things, rng, steps, motion, lambda: joined(rng, _look(rng)), spread_m=0.22)
-    if rng.random() < 0.5:
-        things += _bending(rng, steps, things)
-    for _ in range(rng.integers(4, 8)):
-        _add(things, rng, steps, rest, lambda: joined(rng, _look(rng)), spread_m=0.35)
-    return things
-
-
-def _thin(rng: np.random.Generator, steps: int) -> list[Thing]:
-    def rod() -> tuple[Solid, ...]:
-        length, thick = rng.uniform(0.06, 0.14), rng.uniform(0.002, 0.006)
-        if rng.random() < 0.5:
-            return (Solid("box", (length, thick, thick), look=_look(rng)),)
-        if rng.random() < 0.5:
-            return (Solid("box", (length, rng.uniform(0.03, 0.06), 0.002), look=_look(rng)),)
-        upright = place(0, 0, 0, angles=(rng.uniform(0.2, 1.2), 0, 0))
-        return (Solid("box", (length, rng.uniform(0.03, 0.06), 0.002), upright, _look(rng)),)
-
-    things: list[Thing] = []
-    for _ in range(rng.integers(1, 5)):
-        _add(things, rng, steps, _pick(rng, (slide, push, spin, lift)), rod)
-    return things
-
-
-def _plain(rng: np.random.Generator, steps: int) -> list[Thing]:
-    def large() -> tuple[Solid, ...]:
-        return (random_solid(rng, "plain", low=0.09, high=0.15),)
-
-    things: list[Thing] = []
-    for _ in range(rng.integers(1, 4)):
-        make = large if rng.random() < 0.3 else lambda: joined(rng, "plain")
-        _add(things, rng, steps, _pick(rng, (slide, push, spin, lift)), make)
-    return things
 
 
 def _hands(rng: np.random.Generator, steps: int) -> list[Thing]:
     things: list[Thing] = []
     for _ in range(rng.integers(2, 5)):
-        _add(things, rng, steps, rest, lambda: joined(rng, _look(rng)), spread_m=0.25)
+        add(things, rng, steps, rest, lambda: joined(rng, random_look(rng)), spread_m=0.25)
     if not things:
         return things
     palm, fingers, held = _grasp(rng, steps, things[0])
@@ -170,25 +66,13 @@ def _grasp(rng: np.random.Generator, steps: int, thing: Thing) -> tuple[Thing, l
     return palm, fingers, thing.along(carried(thing.path, path, begin, end))
 
 
-def _bending(rng: np.random.Generator, steps: int, things: Sequence[Thing]) -> list[Thing]:
-    """A strip that somebody lifts at one end, where there is room for it."""
-    for _ in range(_TRIES):
-        x, y = rng.uniform(-0.25, 0.25, 2)
-        start = place(x, y, 0.005, angles=(0, 0, rng.uniform(-np.pi, np.pi)))
-        curl = rng.uniform(0.1, 0.3) * progress(steps, 0.2, 0.5) - rng.uniform(0, 0.2) * progress(steps, 0.6, 0.9)
-        boards = strip(int(rng.integers(5, 9)), rng.uniform(0.02, 0.05), _look(rng), still(start, steps), curl)
-        if all(_free(things, board) for board in boards):
-            return boards
-    return []
-
-
 def _kitchen(rng: np.random.Generator, steps: int) -> list[Thing]:
     things: list[Thing] = []
-    _add(things, rng, steps, _pour, lambda: cup(rng, _look(rng)))
+    add(things, rng, steps, _pour, lambda: cup(rng, random_look(rng)))
     for _ in range(rng.integers(1, 4)):
-        _add(things, rng, steps, _pick(rng, (rest, slide, lift)), lambda: cup(rng, _look(rng)))
-    things += _bending(rng, steps, things)
-    _add(things, rng, steps, rest, lambda: (Solid("box", (0.12, 0.1, 0.006), look=_look(rng)),))
+        add(things, rng, steps, pick(rng, (rest, slide, lift)), lambda: cup(rng, random_look(rng)))
+    things += bending(rng, steps, things)
+    add(things, rng, steps, rest, lambda: (Solid("box", (0.12, 0.1, 0.006), look=random_look(rng)),))
     if rng.random() < 0.5 and things:
         palm, fingers, held = _grasp(rng, steps, things[0].along(still(things[0].path[0], steps)))
         things = [held, *things[1:], palm, *fingers]
@@ -207,7 +91,7 @@ def _articulated(rng: np.random.Generator, steps: int) -> list[Thing]:
     """A box with a door or a lid on a hinge, and a drawer on rails; things before them."""
     width, depth, height = rng.uniform(0.1, 0.16), rng.uniform(0.08, 0.12), rng.uniform(0.1, 0.16)
     case = place(rng.uniform(-0.1, 0.1), 0.1, height, angles=(0, 0, rng.uniform(-0.4, 0.4)))
-    look, t = _look(rng), 0.006
+    look, t = random_look(rng), 0.006
     walls = (
         Solid("box", (width, depth, t), place(0, 0, -height + t), look),
         Solid("box", (width, depth, t), place(0, 0, height - t), look),
@@ -221,8 +105,8 @@ def _articulated(rng: np.random.Generator, steps: int) -> list[Thing]:
     things.append(_drawer(rng, steps, case, width, depth, height))
     for _ in range(rng.integers(0, 3)):
         before = [Thing("room", (Solid("box", (width, depth + 0.25, height)),), still(case, steps))]
-        _add(before, rng, steps, _pick(rng, (slide, spin, rest)), lambda: joined(rng, _look(rng)), spread_m=0.4)
-        things += [x for x in before[1:] if _free(things, x)]
+        add(before, rng, steps, pick(rng, (slide, spin, rest)), lambda: joined(rng, random_look(rng)), spread_m=0.4)
+        things += [x for x in before[1:] if is_free(things, x)]
     return things
 
 
@@ -230,7 +114,7 @@ def _door(rng: np.random.Generator, steps: int, case: Float[np.ndarray, "4 4"], 
     """Before the upper half of a case: it turns about its left edge, or, as a flap, about its lower one."""
     shut = case @ place(0, -d - 0.004, h / 2)
     solids = (
-        Solid("box", (w, 0.004, h / 2 - 0.004), look=_look(rng)),
+        Solid("box", (w, 0.004, h / 2 - 0.004), look=random_look(rng)),
         Solid("box", (0.006, 0.012, 0.03), place(w * 0.75, -0.014, 0), "plain"),
     )
     s = progress(steps, rng.uniform(0.05, 0.3), rng.uniform(0.5, 0.95))
@@ -245,7 +129,7 @@ def _drawer(
     rng: np.random.Generator, steps: int, case: Float[np.ndarray, "4 4"], w: float, d: float, h: float
 ) -> Thing:
     """In the lower half of a case: it comes out, and sometimes goes back."""
-    look, t = _look(rng), 0.004
+    look, t = random_look(rng), 0.004
     solids = (
         Solid("box", (w - 0.014, t, h / 2 - 0.012), place(0, -d, 0), look),
         Solid("box", (w - 0.02, d - 0.02, t), place(0, 0, -h / 2 + 0.02), look),
@@ -262,13 +146,17 @@ FAMILIES = MappingProxyType(
     {
         f.name: f
         for f in (
-            Family("tabletop", "things slid, pushed, turned and lifted on a table", _tabletop),
+            Family("tabletop", "things slid, pushed, turned and lifted on a table", tabletop),
             Family("hands", "a hand that closes over a thing, carries it and sets it down", _hands),
-            Family("clutter", "many things that hide each other, leave and come back; a strip that bends", _clutter),
-            Family("thin", "rods, boards and plates", _thin),
+            Family("clutter", "many things that hide each other, leave and come back; a strip that bends", clutter),
+            Family("thin", "rods, boards and plates", thin),
             Family(
-                "plain", "things of one color before walls of one color, some of them large", _plain, looks=("plain",)
+                "plain", "things of one color before walls of one color, some of them large", plain, looks=("plain",)
             ),
+            Family("flat", "cards and sheets that are slid and lifted; a strip that bends", flat),
+            Family("rolling", "balls and cylinders that roll, or turn where they stand", rolling),
+            Family("swarm", "many small things that move, each for itself", swarm),
+            Family("large", "things that fill much of the picture", large),
             Family("kitchen", "cups that are lifted and poured, a cloth that bends, a hand", _kitchen, held_out=True),
             Family("articulated", "doors, flaps and drawers", _articulated, held_out=True),
         )

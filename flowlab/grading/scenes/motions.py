@@ -108,6 +108,14 @@ def spin(path: Path, rng: np.random.Generator, most: float = 3.0) -> Path:
     return turned(path, np.array([0, 0, 1.0]), when(rng, len(path)) * rng.uniform(0.3, most) * rng.choice([-1, 1]))
 
 
+def roll(path: Path, rng: np.random.Generator) -> Path:
+    """Along the table, turning about its own y axis as what is round does: its center is as high as its radius."""
+    way = rng.uniform(0.06, 0.25) * when(rng, len(path)) * rng.choice([-1, 1])
+    axis = path[0, :3, 1]
+    heading = np.cross(axis, [0.0, 0.0, 1.0])
+    return shifted(turned(path, axis, way / path[0, 2, 3]), way[:, None] * heading)
+
+
 def lift(path: Path, rng: np.random.Generator) -> Path:
     """Up, over, tilting, and down again somewhere else."""
     s = when(rng, len(path))
