@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from flowlab.tracking.chunking import ChunkSettings
 
 
-_FAMILIES = "tabletop, hands, clutter, thin, plain, flat, rolling, swarm, large, kitchen, articulated"  # a test holds it to the families there are
+_FAMILIES = "tabletop, hands, clutter, thin, plain, flat, rolling, swarm, large, kitchen, articulated"
+"""A test holds it to the families there are."""
 
 _CAMERAS = ["fixed", "hand-held", "hand-held, poses known", "traveling", "traveling, poses known"]
 
