@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from flowlab.recordings.sync import common_clock
 from flowlab.recordings.verdicts import Check, Verdict
 
 FEWEST = 20
@@ -61,9 +62,8 @@ def find_offset(pictures: Motion, other: Motion) -> Offset | None:
     if min(len(pictures.time_s), len(other.time_s)) < FEWEST:
         return None
     step = float(np.median(np.diff(pictures.time_s)))
-    start, stop = max(pictures.time_s[0], other.time_s[0]), min(pictures.time_s[-1], other.time_s[-1])
-    clock = np.arange(start, stop, step)
-    if len(clock) < FEWEST or step <= 0:
+    clock = common_clock([pictures.time_s, other.time_s], step, FARTHEST_S)
+    if len(clock) < FEWEST:
         return None
     series = [_on(clock, m) for m in (pictures, other)]
     if any(np.std(s) < _UNEVEN * np.mean(s) or not np.std(s) for s in series):

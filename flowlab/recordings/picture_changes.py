@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Num
 from flowlab.recordings.base import Streams
 from flowlab.recordings.content import PictureDigest
 from flowlab.recordings.motion import FEWEST
-from flowlab.recordings.sync import nearest_sample
+from flowlab.recordings.sync import common_clock
 
 _CELLS = (24, 32)
 """Rows and columns of cells in which changes over time are compared."""
@@ -43,23 +43,11 @@ def find_changes(
         return None
     middle = [(t[1:] + t[:-1]) / 2 for t in times]
     step = float(max(np.median(np.diff(t)) for t in times))
-    clock = _clock(middle, step)
+    clock = common_clock(middle, step, step)
     if len(clock) < FEWEST:
         return None
     seen, read = color_changes(_thinned(color)), depth_changes(_thinned(depth))
     return PictureChanges(_on(clock, middle[0], seen), _on(clock, middle[1], read), step)
-
-
-def _clock(times: list[Float64[np.ndarray, "_"]], step: float) -> Float64[np.ndarray, "T"]:
-    """Instants a step apart at which both were seen within a step; not those of a pause."""
-    start, stop = max(t[0] for t in times), min(t[-1] for t in times)
-    if not (step > 0 and stop > start):
-        return np.empty(0)
-    near = np.concatenate([np.floor((t - start) / step)[:, None] + np.arange(-1, 3) for t in times])
-    clock = start + step * np.unique(near)
-    clock = clock[(clock >= start) & (clock <= stop + 1e-6)]
-    seen = [np.abs(t[nearest_sample(clock, t)] - clock) <= step for t in times]
-    return clock[np.logical_and.reduce(seen)]
 
 
 def correlation(one: np.ndarray, other: np.ndarray) -> float:

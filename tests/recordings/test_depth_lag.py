@@ -1,6 +1,7 @@
 """Depth that was taken later or earlier than color, in recordings whose times do not say so."""
 
 import re
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from real_recordings import write_png, write_yaml
 
 from flowlab.recordings.depth_lag import _lagged_correlations, find_depth_lag
-from flowlab.recordings.motion import Offset
+from flowlab.recordings.motion import Motion, Offset, find_offset
 from flowlab.recordings.picture_changes import find_changes
 
 Capture = pytest.CaptureFixture[str]
@@ -121,6 +122,18 @@ def test_a_pause_of_a_day_takes_no_room() -> None:
     changes = find_changes(SimpleNamespace(color=stream, depth=stream), *kept)  # type: ignore[arg-type]
     assert changes is not None
     assert 50 < len(changes.color) < 70
+
+
+def test_an_offset_is_told_across_a_pause_of_a_year_in_no_room() -> None:
+    clock = np.r_[np.arange(200) / 30, 3e7 + np.arange(200) / 30]
+    speed = np.abs(np.sin(np.arange(399) / 7))
+    tracemalloc.start()
+    found = find_offset(Motion("color", clock[1:], speed), Motion("the robot", clock[1:] + 0.1, speed))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found is not None
+    assert (found.told, found.later_s) == (True, pytest.approx(0.1, abs=1e-3))
+    assert peak < 1e7, "a sample for every instant of the year would be gigabytes"
 
 
 def test_depth_of_a_camera_of_its_own_is_not_late_for_lying_elsewhere(capsys: Capture, tmp_path: Path) -> None:
