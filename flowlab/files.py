@@ -86,6 +86,31 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def new_file_alone(path: Path) -> Iterator[Path]:
+    """:func:`new_file` for a writer that makes files of its own beside what it is told to write.
+
+    These lie in a folder beside it, which is deleted with whatever is left in it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    folder = temporary_path(path)
+    _remove(folder)
+    folder.mkdir()
+    try:
+        temporary = folder / path.name
+        temporary.touch(0o666)
+        usual = temporary.stat().st_mode
+        yield temporary
+        temporary.chmod(usual)  # such writers let nobody else read what they make
+        _sync(temporary)
+        os.replace(temporary, path)
+        sync_folder(path.parent)
+    finally:
+        _remove(folder)
+
+
+@contextmanager
 def output_file(path: Path) -> Iterator[Path]:
     """:func:`new_file` where a user asked for it, in a folder that need not exist; leftovers beside it are deleted.
 

@@ -8,22 +8,26 @@ from typing import Any
 
 import safetensors
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from flowlab.checksums import with_checksum
 from flowlab.errors import DataError
-from flowlab.files import new_file
+from flowlab.files import new_file_alone
 from flowlab.policies.tensor_headers import ABOUT, metadata_of, step_in, understood
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
-    """Write tensors, and what they are. Raises :class:`OSError` where they cannot be written."""
+    """Write tensors, and what they are, without a copy of them in memory: those of a large run fill it.
+
+    Raises:
+        OSError: They cannot be written.
+        SafetensorError: Likewise.
+    """
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     told = json.dumps(with_checksum({**about, "tensors": _digest(plain)}))
-    with new_file(path) as temporary:
-        about_all = {ABOUT: told}  # under one key: several would come in any order
-        temporary.write_bytes(save(plain, about_all))  # save_file has a temporary name of its own, which a kill leaves
+    with new_file_alone(path) as temporary:  # it has a temporary name of its own, which a kill would leave beside it
+        save_file(plain, temporary, {ABOUT: told})  # under one key: several would come in any order
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

@@ -5,6 +5,8 @@ import os
 import re
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -246,6 +248,33 @@ def test_a_damaged_checkpoint_is_said_in_one_sentence(
     assert load_policy(tmp_path / "run").step == 16
     with pytest.raises(DataError, match="there is no such checkpoint"):
         load_policy(newest)
+
+
+SAVES = """
+import resource, sys, torch
+from pathlib import Path
+from flowlab.policies.tensor_files import write_tensors
+tensors = {str(k): torch.full((10_000_000,), float(k)) for k in range(6)}
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+write_tensors(Path(sys.argv[1]), tensors, {"step": 3})
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1000)
+"""
+
+
+def test_to_save_takes_no_second_copy_in_memory(tmp_path: Path) -> None:
+    """The paper's networks have gigabytes of weights, and three times as much that goes on changing."""
+    file = tmp_path / "resume.safetensors"
+    told = subprocess.run([sys.executable, "-c", SAVES, file], capture_output=True, text=True, check=True)
+    assert float(told.stdout) < 60, "of 240 MB"
+    assert file.stat().st_size > 240e6
+    assert file.stat().st_mode & 0o777 == 0o666 & ~umask()
+    assert [p.name for p in tmp_path.iterdir()] == [file.name]
+
+
+def umask() -> int:
+    """Of this process."""
+    os.umask(now := os.umask(0))
+    return now
 
 
 @contextmanager
