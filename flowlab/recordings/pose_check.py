@@ -87,7 +87,7 @@ def _judged(
             f", within {1000 * others[how]:.1f} mm if each were {how}: T_world_cam must map coordinates of the camera "
             "(x right, y down, z forward) to the world's [m]; correct the poses")  # fmt: skip
     explained, taken = _judged_explained(pairs, T, off), _judged_as_taken(source, pairs, T, off, fixed, fits=fits)
-    return taken if explained is None or taken[0].severity > explained[0].severity else explained
+    return taken if explained is None else (max(taken[0], explained[0], key=lambda v: v.severity), explained[1])
 
 
 def _judged_as_taken(
@@ -126,7 +126,7 @@ def _judged_hand(pairs: list[FlowPair], T: Float[np.ndarray, "T 4 4"]) -> _Expla
         return None
     T_world_cam = T @ mounted.T_hand_cam
     off, then = (np.array([p.off_m(poses) for p in pairs]) for poses in (T, T_world_cam))
-    verdict, best = mounted.judged(off, then), float(np.median(then))
+    verdict, best = mounted.judged(off, then, floor_m(pairs)), float(np.median(then))
     return None if verdict is Verdict.OK else (best, verdict, (
         f", within {1000 * best:.1f} mm if they were of a hand on which the camera is turned by "
         f"{np.degrees(mounted.turn_rad):.0f} degrees and {1000 * mounted.away_m:.0f} mm away; {_MUST_BE}"))  # fmt: skip

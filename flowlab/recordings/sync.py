@@ -1,10 +1,11 @@
 """Streams on one clock: what was measured nearest to, or last before, each color picture."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
+_MOST_INSTANTS = 2e6
 GAP = 1.5
 """An interval this many times the median one is a gap: at least one picture is missing."""
 
@@ -25,20 +26,38 @@ def last_sample(clock: Float64[np.ndarray, "T"], time_s: Float64[np.ndarray, "N"
 def common_clock(times: Sequence[Float64[np.ndarray, "_"]], step: float, near: float) -> Float64[np.ndarray, "T"]:
     """Instants a step apart at which every stream was seen so near: not those of a pause, however long that is.
 
+    Empty where they would be millions: stamps are not what they seem.
+
     Args:
         times: When each was seen [s]; they rise.
         step: From one instant to the next [s].
         near: How far from each the nearest of a stream may be [s].
     """
-    start, stop = max(t[0] for t in times), min(t[-1] for t in times)
-    if not (step > 0 and stop > start):
+    parts = [(-np.inf, np.inf)]
+    for t in times:
+        ends = np.flatnonzero(np.diff(t) > 2 * near)
+        seen = zip(t[np.r_[0, ends + 1]] - near, t[np.r_[ends, len(t) - 1]] + near, strict=True)
+        parts = list(_overlaps(parts, [(max(a, t[0]), min(b, t[-1])) for a, b in seen]))
+    if not parts or not step > 0 or sum(b - a for a, b in parts) > _MOST_INSTANTS * step:
         return np.empty(0)
-    reach = int(np.ceil(near / step))
-    around = np.arange(-reach, reach + 2)
-    instants = np.unique(np.concatenate([np.floor((t - start) / step)[:, None] + around for t in times]))
-    clock = start + step * instants
-    clock = clock[(clock >= start) & (clock <= stop + 1e-6)]
-    return clock[np.logical_and.reduce([np.abs(t[nearest_sample(clock, t)] - clock) <= near for t in times])]
+    start = parts[0][0]
+    steps = ((np.ceil((a - start) / step - 1e-6), np.floor((b - start) / step + 1e-6)) for a, b in parts)
+    return start + step * np.concatenate([np.arange(first, last + 1) for first, last in steps])
+
+
+def _overlaps(
+    one: Sequence[tuple[float, float]], other: Sequence[tuple[float, float]]
+) -> Iterator[tuple[float, float]]:
+    """Where stretches of time that rise overlap those of others."""
+    i = k = 0
+    while i < len(one) and k < len(other):
+        start, stop = max(one[i][0], other[k][0]), min(one[i][1], other[k][1])
+        if start < stop:
+            yield start, stop
+        if one[i][1] < other[k][1]:
+            i += 1
+        else:
+            k += 1
 
 
 def sampling_rate(time_s: Float64[np.ndarray, "N"]) -> float:

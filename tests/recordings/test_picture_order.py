@@ -21,12 +21,12 @@ def as_text(first: int = 0, step: int = 1) -> list[int]:
     return sorted(IN_ORDER, key=lambda k: str(first + step * k))
 
 
-@pytest.mark.parametrize("pan", [0.0, 2.0], ids=["camera stands", "camera moves"])
+@pytest.mark.parametrize("pan", [0.0, 0.5], ids=["camera stands", "camera moves"])
 @pytest.mark.parametrize(
     ("color", "depth", "verdict", "says"),
     [
-        (IN_ORDER, IN_ORDER, "ok", "look most like those beside them"),
-        (THERE_AND_BACK, THERE_AND_BACK, "ok", "look most like"),
+        (IN_ORDER, IN_ORDER, "ok", "not as numbers sorted as text"),
+        (THERE_AND_BACK, THERE_AND_BACK, "ok", "not as numbers sorted"),
         (
             as_text(),
             as_text(),
@@ -36,7 +36,7 @@ def as_text(first: int = 0, step: int = 1) -> list[int]:
         (as_text(1), as_text(1), "refused", r"numbers as text \(1, 10, 11, 12, ...\)"),
         (as_text(0, 5), as_text(0, 5), "refused", r"numbers as text \(0, 10, 100, 105, ...\)"),
         (IN_ORDER, as_text(), "refused", "^depth: the pictures seem"),
-        (AT_RANDOM, AT_RANDOM, "refused", "color: the pictures seem to be in no order: the next"),
+        (AT_RANDOM, AT_RANDOM, "doubtful", "the pictures seem to be in no order: the next"),
     ],
     ids=["in order", "there and back", "as text", "from 1", "by fives", "depth alone", "at random"],
 )
@@ -54,3 +54,21 @@ def test_pictures_out_of_order_are_told(
 def test_few_rows_do_not_tell_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run = dry_run(capsys, write(tmp_path / "r", [film(t) for t in range(12)]))
     assert run.checks[ABOUT] == ("assumed", "12 rows are too few to tell it, so it is taken as it is")
+
+
+FLASH = {17: 60.0}
+LAMP = {t: 4.0 * np.random.default_rng(t).normal() for t in range(FRAMES)}
+
+
+@pytest.mark.parametrize("light", [FLASH, LAMP], ids=["a flash", "a lamp that flickers"])
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_light_that_changes_at_once_is_no_order(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, light: dict[int, float], noise: float
+) -> None:
+    """Before a scene that stands still only the light changes, and any picture may look like any other."""
+    frames = []
+    for t in IN_ORDER:
+        rgb, depth = film(9, noise=noise, seed=t)
+        brighter = np.clip(rgb + light.get(t, 0.0), 0, 255).astype(np.uint8)
+        frames.append((brighter, depth))
+    assert dry_run(capsys, write(tmp_path / "r", frames)).checks[ABOUT][0] in ("ok", "assumed")

@@ -249,7 +249,7 @@ LATE = np.stack([pose(t - 0.3) for t in CLOCK])
         (POSES[::-1].copy(), "refused", "explain too little|must be those of the color camera itself"),
         (POSES @ looking((0.1, -0.2, 0.05)), "refused", "not of a flange"),
         (POSES @ on_a_flange(30), "refused", r"on which the camera is turned by (29|30|31) degrees and [67]. mm away"),
-        (POSES @ on_a_flange(8), "refused", r"turned by [789] degrees and [67]. mm away"),
+        (POSES @ on_a_flange(8), "doubtful", r"turned by [789] degrees and [67]. mm away"),
         (np.tile(POSES[:1], (len(POSES), 1, 1)), "refused", "explain too little"),
     ],
 )  # fmt: skip
