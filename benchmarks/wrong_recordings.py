@@ -119,10 +119,10 @@ def _say(recording: str, mistake: str, film: Film) -> Said:
             source = parse_recording(folder, settings)
             checks = list(source.checks)
             source.check_bad_frames(settings)
+            if source.frame_check.bad:
+                checks.append(Check("frames", Verdict.DOUBTFUL, "some are bad and left out"))
         except DataError:
-            return Said(recording, mistake, ("reading",), ())
-        if source.frame_check.bad:
-            checks.append(Check("frames", Verdict.DOUBTFUL, "some are bad and left out"))
+            checks = [Check("reading", Verdict.REFUSED, "it cannot be read, or has too many bad frames")]
     refused, doubtful = (tuple(dict.fromkeys(c.about for c in checks if c.verdict is v)) for v in _SAID)
     print(f"{recording}: {mistake}: refused {list(refused)}, doubtful {list(doubtful)}", flush=True)
     return Said(recording, mistake, refused, doubtful)
