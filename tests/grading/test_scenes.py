@@ -48,7 +48,13 @@ def shown(clip: Clip, truth: GroundTruth) -> tuple[np.ndarray, np.ndarray, np.nd
     return xyz[..., 2] - near, xyz[..., 2] - far, inside
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(
+    "family",
+    [
+        pytest.param(f, marks=pytest.mark.slow) if f in ("tabletop", "clutter", "swarm", "large") else f
+        for f in FAMILIES
+    ],
+)
 def test_the_truth_is_what_the_pictures_show(family: str, tmp_path: Path) -> None:
     """OpenGL's depth against the paths that the things were given: two ways that share no code."""
     clip, truth = film(tmp_path, family, settings=SMALL.model_copy(update={"camera": "hand-held, poses known"}))

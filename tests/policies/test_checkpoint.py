@@ -254,7 +254,7 @@ SAVES = """
 import resource, sys, torch
 from pathlib import Path
 from flowlab.policies.tensor_files import write_tensors
-tensors = {str(k): torch.full((10_000_000,), float(k)) for k in range(6)}
+tensors = {str(k): torch.full((10_000_000,), float(k)) for k in range(3)}
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 write_tensors(Path(sys.argv[1]), tensors, {"step": 3})
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1000)
@@ -265,8 +265,8 @@ def test_to_save_takes_no_second_copy_in_memory(tmp_path: Path) -> None:
     """The paper's networks have gigabytes of weights, and three times as much that goes on changing."""
     file = tmp_path / "resume.safetensors"
     told = subprocess.run([sys.executable, "-c", SAVES, file], capture_output=True, text=True, check=True)
-    assert float(told.stdout) < 60, "of 240 MB"
-    assert file.stat().st_size > 240e6
+    assert float(told.stdout) < 30, "of 120 MB"
+    assert file.stat().st_size > 120e6
     assert file.stat().st_mode & 0o777 == 0o666 & ~umask()
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
 
