@@ -87,7 +87,7 @@ def _late(frames: int) -> Change:
         k = np.arange(len(film.color) - abs(frames))
         return film.rows(k + max(frames, 0), k + max(-frames, 0))
 
-    return make  # fmt: skip
+    return make
 
 
 def _with_depth(change: Callable[[np.ndarray, Film], np.ndarray]) -> Change:
@@ -117,7 +117,7 @@ def _from_beside(meters: float) -> Change:
         moved[v[inside], to[inside]] = depth[v[inside], u[inside]]
         return moved
 
-    return _with_depth(change)  # fmt: skip
+    return _with_depth(change)
 
 
 def _wider(depth: np.ndarray, film: Film) -> np.ndarray:
@@ -136,12 +136,11 @@ def _frozen(stream: Literal["color", "depth"]) -> Change:
     """One stream stands still for the second third."""
 
     def make(film: Film) -> Film:
-        k = np.arange(len(film.color))
-        froze = np.where((k >= len(k) // 3) & (k < 2 * len(k) // 3), len(k) // 3, k)
-        frozen = film.rows(froze, k) if stream == "color" else film.rows(k, froze)
+        k, held = np.arange(len(film.color)), _held(len(film.color))
+        frozen = film.rows(held, k) if stream == "color" else film.rows(k, held)
         return replace(frozen, time_s=film.time_s, T_world_cam=film.T_world_cam)
 
-    return make  # fmt: skip
+    return make
 
 
 def _lost(film: Film) -> Film:
@@ -178,17 +177,17 @@ def _poses(change: Callable[[np.ndarray], np.ndarray]) -> Mistake:
         assert film.T_world_cam is not None
         return replace(film, T_world_cam=change(film.T_world_cam))
 
-    return Mistake(make, posed=True)  # fmt: skip
+    return Mistake(make, posed=True)
 
 
 def _scaled(share: float) -> Mistake:
     return _poses(lambda T: rigid(T[:, :3, :3], T[:1, :3, 3] + share * (T[:, :3, 3] - T[:1, :3, 3])))
 
 
-def _stuck(T: np.ndarray) -> np.ndarray:
-    """Tracking was lost for the second third: the last pose that was known is given."""
-    k = np.arange(len(T))
-    return T[np.where((k >= len(k) // 3) & (k < 2 * len(k) // 3), len(k) // 3, k)]
+def _held(count: int) -> np.ndarray:
+    """Which of so many is shown where the second third stands still."""
+    k = np.arange(count)
+    return np.where((k >= count // 3) & (k < 2 * count // 3), count // 3, k)
 
 
 def _other_quaternions(T: np.ndarray) -> np.ndarray:
@@ -240,7 +239,7 @@ MISTAKES = MappingProxyType(
         "rotations transposed": _poses(lambda T: rigid(T[:, :3, :3].swapaxes(1, 2), T[:, :3, 3])),
         "poses backward": _poses(lambda T: T[::-1]),
         "poses 5 frames late": _poses(lambda T: T[np.maximum(np.arange(len(T)) - 5, 0)]),
-        "poses frozen for a third": _poses(_stuck),
+        "poses frozen for a third": _poses(lambda T: T[_held(len(T))]),
         "poses x 0.7": _scaled(0.7),
         "poses x 1.5": _scaled(1.5),
     }

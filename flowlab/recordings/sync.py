@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 _MOST_INSTANTS = 2e6
+"""A day at 23 a second: where a clock would have more, stamps are not what they seem."""
 GAP = 1.5
 """An interval this many times the median one is a gap: at least one picture is missing."""
 
