@@ -1,8 +1,9 @@
 """Which motion carries a point, where the pictures alone would not tell, or tell it wrong."""
 
+import moving_planes
 import numpy as np
 import pytest
-from rigid_body_scenes import FRAMES, Scene, fit_of, two_plates
+from rigid_body_scenes import FRAMES, Scene, fit_of, scene, two_plates
 
 from flowlab.records import Clip
 from flowlab.tracking.trackers.rigid_bodies.choice import FollowedPoints, MotionChoice, choose_motions
@@ -83,4 +84,18 @@ def test_what_a_motion_explains_stays_with_it_whatever_is_around() -> None:
     uv = seen.some_pixels(1, 60, border=2)
     path = seen.motion(1).apply(seen.points(uv))
     found = choice(seen, uv, [seen.motion(1), seen.motion(2)], path, believed=False)
+    assert (found.motion == 1).mean() > 0.95
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_the_border_of_a_card_that_slides_on_a_table_goes_with_it(seed: int) -> None:
+    """Of depth nothing tells it from the table, which stands still all around and has the mean color of the border."""
+    card = moving_planes.moving(
+        (0.3, 0.22), (-0.12, 0, 0.999), np.array([0.012, 0.002, 0]), np.array([0, 0, 0.01]), FRAMES, seed
+    )
+    seen = scene([moving_planes.wall(1.0, FRAMES), card], noise=0.001)
+    border = seen.owner == 1
+    border[tuple(seen.pixels(1, 1).T[::-1])] = False
+    uv = np.argwhere(border)[:, ::-1].astype(np.int32)
+    found = choice(seen, uv, [seen.motion(1)], np.zeros((FRAMES, len(uv), 3)), believed=False)
     assert (found.motion == 1).mean() > 0.95

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from flowlab.tracking.trackers.rigid_bodies import _costs
 from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
 
 _OWN_WEIGHT = 0.7
 """Weight of a point's own cost against one cell's that looks exactly like it."""
@@ -66,11 +66,16 @@ def choose_motions(
         paths: Where each motion takes them [m], in the camera frame; of the first frame, where they are.
         followed: Where another tracker does.
     """
-    cost = _picture_costs(fit, uv, z, motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0]))
+    replaced = _replaced(fit.grid, uv)
+    own = motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0])
+    own[:, replaced] = motion_costs(fit.pictures, fit.grid, fit.motions, uv[replaced], paths[0, 0, replaced], 0.0)
+    cost = _picture_costs(fit, uv, z, own, replaced)
     against = cost + _ELSEWHERE * _ramp(cost.min(0), *_BADLY_SHOWN) * _elsewhere(paths, followed)
     unexplained = _ramp(against.min(0), *_UNEXPLAINED)
     doubtful = np.flatnonzero(unexplained)
-    against[:, doubtful] += _FOREIGN * unexplained[doubtful] * (1 - _taken_around(fit, paths[0, 0, doubtful]))
+    against[:, doubtful] += (
+        _FOREIGN * unexplained[doubtful] * (1 - _taken_around(fit, paths[0, 0, doubtful], replaced[doubtful]))
+    )
     motion = against.argmin(0)
     return MotionChoice(motion, cost[motion, np.arange(len(uv))], against.astype(np.float32))
 
@@ -80,12 +85,31 @@ def _ramp(cost: np.ndarray, low: float, high: float) -> np.ndarray:
     return ((cost - low) / (high - low)).clip(0, 1)
 
 
-def _picture_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndarray) -> Float32[np.ndarray, "B M"]:
+def _cells(grid: MotionGrid, uv: Float[np.ndarray, "M 2"]) -> tuple[Int64[np.ndarray, "M"], Int64[np.ndarray, "M"]]:
+    """Row and column of the cells that pixels lie in."""
+    height, width = grid.valid.shape
+    i, j = np.rint(uv[:, 1] / STEP).astype(int), np.rint(uv[:, 0] / STEP).astype(int)
+    return i.clip(0, height - 1), j.clip(0, width - 1)
+
+
+def _replaced(grid: MotionGrid, uv: Float[np.ndarray, "M 2"]) -> Bool[np.ndarray, "M"]:
+    """Which points lie where something else is seen later, no less deep: as of a card that slides on a table.
+
+    Nothing but the change tells such a thing from what it lies on. So what is known to stand still has no say in them,
+    and that most things do is no reason to take it that they do.
+    """
+    at = _cells(grid, uv)
+    return np.asarray(grid.changed[at] & ~grid.moved[at] & ~grid.edge[at])
+
+
+def _picture_costs(
+    fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.ndarray, replaced: np.ndarray
+) -> Float32[np.ndarray, "B M"]:
     """The points' own costs (B, M) averaged with those of the cells around that are as deep and colored alike."""
     grid, height, width = fit.grid, *fit.grid.valid.shape
     features = _costs.features_at(fit.pictures.feature[0], uv.astype(np.float32))[:, 1:]
     cell_features = fit.pictures.feature[0, ::STEP, ::STEP, 1:].astype(np.float32)
-    i, j = np.rint(uv[:, 1] / STEP).astype(int), np.rint(uv[:, 0] / STEP).astype(int)
+    i, j = _cells(grid, uv)
     total, weights = _OWN_WEIGHT * own, np.full(len(uv), _OWN_WEIGHT)
     scale = np.array([_costs.L, _costs.A, _costs.B])
     for y in range(-3, 4):
@@ -93,7 +117,8 @@ def _picture_costs(fit: RigidBodyFit, uv: np.ndarray, z: np.ndarray, own: np.nda
             a, b = np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)
             far = np.abs(grid.depth[a, b] - z) / (0.01 * np.maximum(1, z))
             color = (np.abs(cell_features[a, b] - features) * scale).sum(1)
-            w = grid.valid[a, b] * np.exp(-np.minimum(far, 20) - color / 0.35 - (x * x + y * y) / 8)
+            has_say = grid.valid[a, b] & (grid.undecided[a, b] | ~replaced)
+            w = has_say * np.exp(-np.minimum(far, 20) - color / 0.35 - (x * x + y * y) / 8)
             total = total + w * fit.assignment.raw[:, a, b]
             weights = weights + w
     return (total / weights).astype(np.float32)
@@ -109,17 +134,20 @@ def _elsewhere(paths: Float64[np.ndarray, "B T M 3"], followed: FollowedPoints) 
     return np.stack([(o * tells).sum(0) / np.maximum(tells.sum(0), 1) for o in off])
 
 
-def _taken_around(fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "B m"]:
+def _taken_around(
+    fit: RigidBodyFit, xyz_cam: Float64[np.ndarray, "m 3"], replaced: Bool[np.ndarray, "m"]
+) -> Float64[np.ndarray, "B m"]:
     """The share of what is around points of the first frame that takes each motion, what it explains best most."""
     cells = fit.grid.valid
     cost, owner = fit.assignment.cost[:, cells], fit.assignment.best_motion[cells]
     at = fit.pictures.unproject(fit.grid.pixels(cells).astype(float), fit.grid.depth[cells].astype(float))
-    says = np.exp(-cost.min(0) / _CELL_COST)
+    says, undecided = np.exp(-cost.min(0) / _CELL_COST), fit.grid.undecided[cells]
     share = np.full((len(cost), len(xyz_cam)), 1 / len(cost))
     tree = cKDTree(at)
     for k, point in enumerate(xyz_cam):  # one by one: of thousands of points near the camera, all lists take gigabytes
-        near = tree.query_ball_point(point, 3 * _REACH_M)
-        if near:
+        near = np.array(tree.query_ball_point(point, 3 * _REACH_M), int)
+        near = near[undecided[near]] if replaced[k] else near
+        if len(near):
             weight = says[near] * np.exp(-np.linalg.norm(at[near] - point, axis=1) / _REACH_M)
             share[:, k] = np.bincount(owner[near], weight, len(cost)) / weight.sum()
     return share
