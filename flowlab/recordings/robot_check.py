@@ -41,6 +41,8 @@ _LEFT = 0.13
 """And where steps are off by less than this share of the way, in the median."""
 _SHEARED = 1.35
 """What explains so many times as much once its axes are sheared is no position."""
+_MIRRORED = 0.8
+"""A turn is told where a mirrored robot explains less than this share."""
 _SURE = 0.08
 """A scale that is less sure (one standard deviation) is not told."""
 _FINE, _DOUBTED, _WRONG = 0.1, 0.16, 0.23
@@ -52,7 +54,7 @@ _ONE_KIND = 0.15
 """Scales are of a focal length, or of a unit, where they differ by less from what it would do."""
 _TURNED_RAD, _TURN_SURE_RAD = float(np.radians(20)), float(np.radians(10))
 _READ_RAD = float(np.radians(15))
-"""Another reading of T_world_cam is the right one where it turns to within this of what is seen."""
+"""Another reading of T_world_cam is the right one where it turns to within this of what is seen, and it is in place."""
 _AWAY_M = 0.6
 """What moves with the robot is at most so far from its position [m]."""
 _LAGS_S = 0.4
@@ -150,6 +152,13 @@ def _holds(found: Explanation, agree: float) -> bool:
 def _sheared(steps: SeenSteps, found: Explanation) -> bool:
     """Whether more goes along if the state's axes are sheared: then they are no position."""
     return linear_support(steps, found.motion).score > _SHEARED * found.support.score
+
+
+def _mirrored(steps: SeenSteps, found: Explanation) -> bool:
+    """Whether things go nearly as well as a mirror shows the robot: of what goes about in a plane that is not told, nor
+    is then how the camera is turned."""
+    mirror = as_said(replace(steps, way=-steps.way, at=-steps.at), None)
+    return mirror is not None and mirror.support.score > _MIRRORED * found.support.score
 
 
 def _as_said(steps: SeenSteps, said: Explanation, T: np.ndarray | None, write_to: str) -> Check:
@@ -259,7 +268,7 @@ def _otherwise(
     if fit is not None and not _sheared(steps, fit):
         sure = sureness(steps, fit.motion, fit.support, turns=fit.turned)
         told = _told(fit, sure, T)
-        if told is not None:
+        if told is not None and not (T is not None and fit.turned and not fit.scaled and _mirrored(steps, fit)):
             goes = f"{_goes(fit)} {_numbers(fit, sure)}" if fit.scaled else _goes(fit)
             return Check(_ABOUT, told[0], f"{goes} {_AS}{told[1]}; {_correct(write_to)}")
     return Check(_ABOUT, Verdict.ASSUMED, "little of what is seen to move goes as the first three numbers of its state "
@@ -289,7 +298,8 @@ def _turned(fit: Explanation, T: np.ndarray, angle: float) -> tuple[Verdict, str
     """What a turn against T_world_cam says of it."""
     says = f", turned by {np.degrees(angle):.0f} degrees against T_world_cam"
     for how, read in READINGS.items():
-        R = read(rigid(T[:3, :3], T[:3, 3]))[:3, :3]
-        if turn_between(fit.motion.R_cam_base, R.T) < _READ_RAD:
+        meant = read(rigid(T[:3, :3], T[:3, 3]))
+        away = _away(fit, meant)
+        if turn_between(fit.motion.R_cam_base, meant[:3, :3].T) < _READ_RAD and away is not None and away < _AWAY_M:
             return Verdict.REFUSED, f"{says}, and as it says if it were {how}"
     return Verdict.DOUBTFUL, f"{says}: that is wrong, or not of the frame of these numbers"
