@@ -22,7 +22,8 @@ K = np.array([[F, 0, 79.5], [0, F, 59.5], [0, 0, 1]])
 POSE = looking((0.3, -0.9, 0.7))
 GRIPPER = Box((0.0, -0.1, 0.25), (0.14, 0.1, 0.14), (220, 190, 60))
 _T = np.linspace(0, 2 * np.pi, FRAMES)
-PLACES = np.stack([0.2 * np.sin(_T), 0.14 * np.sin(2 * _T + 0.5), 0.1 * np.cos(3 * _T)], -1)
+_WAY = np.stack([0.2 * np.sin(_T), 0.14 * np.sin(2 * _T + 0.5), 0.1 * np.cos(3 * _T)], -1)
+PLACES = _WAY + np.array(GRIPPER.center)
 """Where the gripper is in the robot's base, which is the world [m]: not along one line, nor in one plane."""
 OPENGL = np.diag([1.0, -1, -1, 1])
 TURNED = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -32,8 +33,8 @@ TURNED = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The pictures of a gripper that goes about before a table and a wall."""
     folder = tmp_path_factory.mktemp("robot")
-    for k, place in enumerate(PLACES):
-        rgb, depth = film((TABLE, WALL, FLOOR, *THINGS, GRIPPER.moved(place)), K, SIZE, POSE, seed=k)
+    for k, way in enumerate(_WAY):
+        rgb, depth = film((TABLE, WALL, FLOOR, *THINGS, GRIPPER.moved(way)), K, SIZE, POSE, seed=k)
         write_png(folder / "color" / f"{k:04d}.png", rgb)
         write_png(folder / "depth" / f"{k:04d}.png", np.rint(depth / UNIT_M).astype(np.uint16))
     return folder
@@ -89,8 +90,8 @@ def test_a_wrong_focal_length_is_told_without_a_pose_too(folder: Path) -> None:
 
 
 def _joints(places: np.ndarray) -> np.ndarray:
-    """Angles of an arm with two links of 0.5 m, whose base is 0.6 m behind."""
-    x, y, z = (places + np.array([0.0, 0.6, 0.1])).T
+    """Angles of an arm with two links of 0.5 m, whose base is 0.7 m behind."""
+    x, y, z = (places + np.array([0.0, 0.7, -0.15])).T
     out, far = np.hypot(x, y), np.linalg.norm([x, y, z], axis=0)
     elbow = np.arccos(1 - far**2 / 0.5)
     return np.stack([np.arctan2(y, x), np.arctan2(z, out) + (np.pi - elbow) / 2, elbow], -1)
