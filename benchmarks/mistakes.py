@@ -34,6 +34,10 @@ class Film:
     """Of a camera whose poses are known."""
     still: bool
     """Whether the camera does not move."""
+    stands: np.ndarray | None = None
+    """T_world_cam of a camera that does not move, where it is known."""
+    state: np.ndarray | None = None
+    """Of the robot, whose first three numbers are its gripper's position in the world [m]; a row for every picture."""
 
     def write(self, folder: Path) -> None:
         """Write it as a plain folder."""
@@ -49,6 +53,11 @@ class Film:
         if self.T_world_cam is not None:
             np.save(folder / "T_world_cam.npy", self.T_world_cam)
             about["T_world_cam_file"] = "T_world_cam.npy"
+        if self.stands is not None:
+            about["T_world_cam"] = self.stands.tolist()
+        if self.state is not None:
+            np.save(folder / "state.npy", self.state)
+            about["state"] = "state.npy"
         (folder / FILE_NAME).write_text(yaml.safe_dump(about))
 
     def rows(self, color: np.ndarray, depth: np.ndarray) -> "Film":
@@ -59,6 +68,7 @@ class Film:
             self, color=tuple(self.color[k] for k in color), depth=tuple(self.depth[k] for k in depth),
             time_s=tuple(self.time_s[k] for k in color),
             T_world_cam=None if self.T_world_cam is None else self.T_world_cam[color],
+            state=None if self.state is None else self.state[color],
         )  # fmt: skip
 
 
@@ -74,10 +84,19 @@ class Mistake:
     """Whether only a camera that does not move is asked."""
     posed: bool = False
     """Whether only a camera whose poses are known is asked."""
+    stood: bool = False
+    """Whether only a camera that does not move, and whose pose is known, is asked."""
+    acting: bool = False
+    """Whether only recordings with a state are."""
 
     def concerns(self, film: Film) -> bool:
         """Whether it can be made with this film."""
-        return (film.still or not self.still) and (film.T_world_cam is not None or not self.posed)
+        return (
+            (film.still or not self.still)
+            and (film.T_world_cam is not None or not self.posed)
+            and (film.stands is not None or not self.stood)
+            and (film.state is not None or not self.acting)
+        )
 
 
 def _late(frames: int) -> Change:
@@ -138,7 +157,7 @@ def _frozen(stream: Literal["color", "depth"]) -> Change:
     def make(film: Film) -> Film:
         k, held = np.arange(len(film.color)), _held(len(film.color))
         frozen = film.rows(held, k) if stream == "color" else film.rows(k, held)
-        return replace(frozen, time_s=film.time_s, T_world_cam=film.T_world_cam)
+        return replace(frozen, time_s=film.time_s, T_world_cam=film.T_world_cam, state=film.state)
 
     return make
 
@@ -152,7 +171,8 @@ def _lost(film: Film) -> Film:
 def _as_text(film: Film) -> Film:
     """Pictures in the order of their numbers as text, but times: 0, 1, 10, 11, ..."""
     order = sorted(range(len(film.color)), key=str)
-    return replace(film.rows(np.array(order), np.array(order)), time_s=film.time_s, T_world_cam=film.T_world_cam)
+    sorted_as_text = film.rows(np.array(order), np.array(order))
+    return replace(sorted_as_text, time_s=film.time_s, T_world_cam=film.T_world_cam, state=film.state)
 
 
 def _bumped(film: Film) -> Film:
@@ -178,6 +198,28 @@ def _poses(change: Callable[[np.ndarray], np.ndarray]) -> Mistake:
         return replace(film, T_world_cam=change(film.T_world_cam))
 
     return Mistake(make, posed=True)
+
+
+def _stands(change: Callable[[np.ndarray], np.ndarray]) -> Mistake:
+    def make(film: Film) -> Film:
+        assert film.stands is not None
+        return replace(film, stands=change(film.stands))
+
+    return Mistake(make, stood=True)
+
+
+def _turned(degrees: float) -> Mistake:
+    """About an axis that is none of the camera's."""
+    R = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.64, 0.48])).as_matrix()
+    return _stands(lambda T: rigid(T[:3, :3] @ R, T[:3, 3]))
+
+
+def _with_state(change: Callable[[np.ndarray], np.ndarray]) -> Mistake:
+    def make(film: Film) -> Film:
+        assert film.state is not None
+        return replace(film, state=change(film.state))
+
+    return Mistake(make, acting=True)
 
 
 def _scaled(share: float) -> Mistake:
@@ -242,6 +284,13 @@ MISTAKES = MappingProxyType(
         "poses frozen for a third": _poses(lambda T: T[_held(len(T))]),
         "poses x 0.7": _scaled(0.7),
         "poses x 1.5": _scaled(1.5),
+        "T_world_cam turned by 10 degrees": _turned(10),
+        "T_world_cam turned by 30 degrees": _turned(30),
+        "T_world_cam turned by 90 degrees": _turned(90),
+        "T_world_cam inverted": _stands(inverse),
+        "T_world_cam in OpenGL's axes": _stands(lambda T: T @ _OPENGL),
+        "state 5 frames late": _with_state(lambda s: s[np.maximum(np.arange(len(s)) - 5, 0)]),
+        "state in millimeters": _with_state(lambda s: np.concatenate([1000 * s[:, :3], s[:, 3:]], 1)),
     }
 )
 """By name."""

@@ -106,6 +106,8 @@ def _read(folder: Path) -> Film:
         known.depth_unit_m,
         seen.T_world_cam,
         seen.T_world_cam is None,
+        None if seen.T_world_cam is not None or known.T_world_cam is None else np.array(known.T_world_cam),
+        source.rows().state if source.streams.state else None,
     )
 
 

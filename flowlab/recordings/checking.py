@@ -10,6 +10,7 @@ from flowlab.recordings.motion_check import check_motion
 from flowlab.recordings.number_check import check_numbers
 from flowlab.recordings.pose_check import check_poses_fit
 from flowlab.recordings.registration_check import check_registration
+from flowlab.recordings.robot_check import check_robot
 from flowlab.recordings.verdicts import Check, Verdict
 from flowlab.recordings.world_check import check_world
 
@@ -45,4 +46,7 @@ def _geometry(source: "ParsedRecording") -> Iterator[Check]:
         return  # what follows is seen through these
     yield check_registration(source)
     yield from check_world(source)
-    yield check_motion(source) if seen.T_world_cam is None else check_poses_fit(source)
+    camera = check_motion(source) if seen.T_world_cam is None else check_poses_fit(source)
+    yield camera
+    if camera.verdict in (Verdict.OK, Verdict.ASSUMED):  # else what moves is not told from what only seems to
+        yield from check_robot(source)
