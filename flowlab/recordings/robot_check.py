@@ -47,12 +47,12 @@ _MIRRORED = 0.8
 """A turn is told where a mirrored robot explains less than this share."""
 _SURE = 0.08
 """A scale that is less sure (one standard deviation) is not told."""
-_FINE, _DOUBTED, _WRONG = 0.1, 0.16, 0.23
-"""Scales (as logarithms) up to which calibration is right, and from which on it is doubtful, and wrong: flow at the
+_FINE, _DOUBTED = 0.1, 0.16
+"""Scales (as logarithms) up to which calibration is right, and from which on it is doubtful: flow at the
 rim of a gripper takes off 4 % of its steps, as of 25 tasks, and points of a forearm some more."""
 _STRONG = (12, 0.7, 0.1)
-"""Pairs, their share and what steps are off by, to refuse a scale, and to doubt one where nothing is said of how the
-camera is turned: with less, velocities did so once."""
+"""Pairs, their share and what steps are off by, to doubt a scale where nothing is said of how the camera is turned:
+with less, velocities did so once."""
 _ONE_KIND = 0.15
 """Scales are of a focal length, or of a unit, where they differ by less from what it would do."""
 _TURNED_RAD, _TURN_SURE_RAD = float(np.radians(20)), float(np.radians(10))
@@ -227,7 +227,6 @@ def _away(found: Explanation, T: np.ndarray | None) -> float | None:
 class _WrongScale:
     """What scales say of focal length and unit."""
 
-    verdict: Verdict
     says: str
     what: str | None
     """The key that is wrong, where it is one."""
@@ -242,15 +241,14 @@ def _judged_scale(found: Explanation, sure: Sureness) -> _WrongScale | None:
     worst, off_by = max((abs(across), sure.across), (abs(along), sure.along) if deep else (0.0, 0.0))
     if worst < _DOUBTED + 2 * off_by:
         return None
-    verdict = Verdict.REFUSED if worst >= _WRONG + 2 * off_by and deep else Verdict.DOUBTFUL
     if deep and abs(along) <= _ONE_KIND:
         size = f"{np.exp(abs(across)):.2f} times too {'large' if across < 0 else 'small'}"
-        return _WrongScale(verdict, f"the focal length in 'intrinsics' is {size}", "intrinsics")
+        return _WrongScale(f"the focal length in 'intrinsics' is {size}", "intrinsics")
     if deep and abs(across - along) <= _ONE_KIND:
         times = float(np.exp((across + along) / 2))
         size = f"{max(times, 1 / times):.3g} times too {'large' if times > 1 else 'small'}"
-        return _WrongScale(verdict, f"'depth_unit_m' is {size}", "depth_unit_m")
-    return _WrongScale(Verdict.DOUBTFUL, "'depth_unit_m' or the focal length in 'intrinsics' is wrong", None)
+        return _WrongScale(f"'depth_unit_m' is {size}", "depth_unit_m")
+    return _WrongScale("'depth_unit_m' or the focal length in 'intrinsics' is wrong", None)
 
 
 def _at_other_times(seen: Seen, R: np.ndarray | None, most: float) -> Check | None:
@@ -277,12 +275,12 @@ def _otherwise(
         told = _told(fit, sure, T)
         if told is not None and not (T is not None and fit.turned and not fit.scaled and _mirrored(steps, fit)):
             goes = f"{_goes(fit)} {_numbers(fit, sure)}" if fit.scaled else _goes(fit)
-            return Check(_ABOUT, told[0], f"{goes} {_AS}{told[1]}; {_correct(write_to)}")
+            return Check(_ABOUT, Verdict.DOUBTFUL, f"{goes} {_AS}{told}; {_correct(write_to)}")
     return Check(_ABOUT, Verdict.ASSUMED, "little of what is seen to move goes as the first three numbers of its state "
                  "do: these are no position in meters, or the gripper is not seen")  # fmt: skip
 
 
-def _told(fit: Explanation, sure: Sureness, T: np.ndarray | None) -> tuple[Verdict, str] | None:
+def _told(fit: Explanation, sure: Sureness, T: np.ndarray | None) -> str | None:
     """What another explanation says of calibration; None where it is not sure, or of two mistakes at once: angles of
     joints are explained by these now and then."""
     scale = _judged_scale(fit, sure) if fit.scaled else None
@@ -299,15 +297,15 @@ def _told(fit: Explanation, sure: Sureness, T: np.ndarray | None) -> tuple[Verdi
     away = _away(fit, T)
     if (away is None and (not strong or scale.what is None)) or (away is not None and away > _GRIPPER_M):
         return None
-    return scale.verdict if strong else Verdict.DOUBTFUL, f": {scale.says}"
+    return f": {scale.says}"
 
 
-def _turned(fit: Explanation, T: np.ndarray, angle: float) -> tuple[Verdict, str]:
+def _turned(fit: Explanation, T: np.ndarray, angle: float) -> str:
     """What a turn against T_world_cam says of it."""
     says = f", turned by {np.degrees(angle):.0f} degrees against T_world_cam"
     for how, read in READINGS.items():
         meant = read(rigid(T[:3, :3], T[:3, 3]))
         away = _away(fit, meant)
         if turn_between(fit.motion.R_cam_base, meant[:3, :3].T) < _READ_RAD and away is not None and away < _AWAY_M:
-            return Verdict.REFUSED, f"{says}, and as it says if it were {how}"
-    return Verdict.DOUBTFUL, f"{says}: that is wrong, or not of the frame of these numbers"
+            return f"{says}, and as it says if it were {how}"
+    return f"{says}: that is wrong, or not of the frame of these numbers"
