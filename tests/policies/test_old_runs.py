@@ -46,11 +46,13 @@ def check_same(found: Any, wanted: Any, name: str = "") -> None:
 
 
 def check_learned(found: np.ndarray, wanted: np.ndarray, name: str) -> None:
-    """All but a few: gradients are summed in another order than then, and AdamW makes steps of their signs where they
-    are next to nothing. They are nothing before a norm of groups of one channel each, which takes biases away again."""
+    """All but a few, or one of few: gradients are summed in another order than then, on an Intel Xeon with AMX in still
+    another, and AdamW makes steps of their signs where they are next to nothing. They are nothing before a norm of
+    groups of one channel each, which takes biases away again."""
     off = np.abs(found - wanted)
     assert off.max() < 0.005, name
-    assert name.endswith("conv.linear.bias") or (off > 1e-5 + 1e-4 * np.abs(wanted)).mean() < 0.02, name
+    many = (off > 1e-5 + 1e-4 * np.abs(wanted)).sum() > max(1, 0.02 * off.size)
+    assert name.endswith("conv.linear.bias") or not many, name
 
 
 @pytest.mark.parametrize("name", RUNS)
