@@ -12,6 +12,7 @@ from flowlab.errors import DataError
 from flowlab.geometry.transforms import apply, inverse
 from flowlab.recordings.base import BadImage
 from flowlab.recordings.frame_processing import FrameProcessor
+from flowlab.recordings.small_rows import SmallRow
 
 if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
@@ -55,11 +56,13 @@ class RigidFit:
 
 
 def rotation_between(
-    first: Float64[np.ndarray, "N 3"], second: Float64[np.ndarray, "N 3"]
-) -> Float64[np.ndarray, "3 3"]:
-    """The rotation that takes vectors to others as well as one can (Kabsch)."""
-    U, _, Vt = np.linalg.svd(first.T @ second)
-    return np.asarray(Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T)
+    first: Float64[np.ndarray, "*batch N 3"], second: Float64[np.ndarray, "*batch N 3"]
+) -> Float64[np.ndarray, "*batch 3 3"]:
+    """The rotations that take vectors to others as well as one can (Kabsch)."""
+    U, _, Vt = np.linalg.svd(np.swapaxes(first, -1, -2) @ second)
+    V = np.swapaxes(Vt, -1, -2).copy()
+    V[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return np.asarray(V @ np.swapaxes(U, -1, -2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,18 +172,10 @@ _Taken = tuple[np.ndarray, np.ndarray]
 
 def _taken(source: "ParsedRecording", processor: FrameProcessor, row: int) -> _Taken:
     """What a row shows."""
-    seen, camera = source.frame_check, processor.camera
-    gray = cv2.cvtColor(processor.color(source.streams.color.read(int(seen.color[row]))), cv2.COLOR_RGB2GRAY)
-    depth = processor.depth(source.streams.depth.read(int(seen.depth[row])))
-    n = max(1, round(camera.width / _WIDTH))
-    gray = cv2.resize(gray[: gray.shape[0] // n * n, : gray.shape[1] // n * n], None, fx=1 / n, fy=1 / n,
-                      interpolation=cv2.INTER_AREA)  # fmt: skip
-    first = (n - 1) // 2
-    depth = depth[first::n, first::n][: gray.shape[0], : gray.shape[1]]
-    v, u = np.mgrid[: gray.shape[0], : gray.shape[1]]
-    points = camera.at(np.eye(4)).unproject(np.stack([u, v], -1) * n + first, depth)
-    points[depth <= 0] = np.nan
-    return gray, points
+    small = SmallRow.read(source, processor, row, _WIDTH)
+    points = small.unproject(small.depth, (small.factor - 1) // 2)
+    points[small.depth <= 0] = np.nan
+    return small.gray, points
 
 
 def _matched(flow: "cv2.DISOpticalFlow", rows: tuple[int, int], one: _Taken, other: _Taken) -> FlowPair | None:

@@ -66,8 +66,6 @@ gripper is seen they are 0.09 to 0.24 m away, of one whose forearm hides it 0.32
 _LAGS_S = 0.4
 """State is tried at times up to so much off [s]."""
 _LAG_STEPS = 4
-_LATE_BETTER = 1.3
-"""State of other times is told where it explains so many times as much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +77,17 @@ class Seen:
 
     def at(self, late_s: float = 0.0) -> SeenSteps:
         """Steps of points with those of a state to whose times so much was added [s]."""
-        pairs = [(p, *positions_at(self.state, np.array(p.time_s) - late_s)) for p in self.points]
-        pairs = [x for x in pairs if np.linalg.norm(x[2] - x[1]) >= _LEAST_WAY_M]
-        none = [np.empty((0, 3))]
+        times = np.array([p.time_s for p in self.points]).reshape(-1, 2) - late_s
+        at = positions_at(self.state, times.ravel()).reshape(-1, 2, 3)
+        way = at[:, 1] - at[:, 0]
+        goes = np.linalg.norm(way, axis=1) >= _LEAST_WAY_M
+        points, none = [p for p, tells in zip(self.points, goes, strict=True) if tells], [np.empty((0, 3))]
         return SeenSteps(
-            np.repeat(np.arange(len(pairs)), [len(p.start) for p, _, _ in pairs]).astype(np.int64),
-            np.concatenate([p.start for p, _, _ in pairs] or none),
-            np.concatenate([p.step for p, _, _ in pairs] or none),
-            np.array([a for _, a, _ in pairs]).reshape(-1, 3),
-            np.array([b - a for _, a, b in pairs]).reshape(-1, 3),
+            np.repeat(np.arange(len(points)), [len(p.start) for p in points]).astype(np.int64),
+            np.concatenate([p.start for p in points] or none),
+            np.concatenate([p.step for p in points] or none),
+            at[goes, 0],
+            way[goes],
         )
 
     def lags(self) -> list[float]:

@@ -13,6 +13,7 @@ from flowlab.errors import DataError
 from flowlab.geometry.transforms import apply, inverse
 from flowlab.recordings.base import BadImage, SampleStream
 from flowlab.recordings.frame_processing import FrameProcessor
+from flowlab.recordings.small_rows import SmallRow
 
 if TYPE_CHECKING:
     from flowlab.recordings.parsing import ParsedRecording
@@ -123,21 +124,13 @@ _Taken = tuple[np.ndarray, np.ndarray]
 
 def _taken(source: "ParsedRecording", processor: FrameProcessor, row: int) -> _Taken:
     """What a row shows."""
-    seen, camera = source.frame_check, processor.camera
-    gray = cv2.cvtColor(processor.color(source.streams.color.read(int(seen.color[row]))), cv2.COLOR_RGB2GRAY)
-    depth = processor.depth(source.streams.depth.read(int(seen.depth[row])))
-    n = max(1, round(camera.width / _WIDTH))
-    gray = cv2.resize(gray[: gray.shape[0] // n * n, : gray.shape[1] // n * n], None, fx=1 / n, fy=1 / n,
-                      interpolation=cv2.INTER_AREA)  # fmt: skip
-    first = (n - 1) // 2
-    depth = depth[first::n, first::n][: gray.shape[0], : gray.shape[1]]
-    smooth = cv2.medianBlur(np.ascontiguousarray(depth, np.float32), 5)
+    small = SmallRow.read(source, processor, row, _WIDTH)
+    smooth = cv2.medianBlur(np.ascontiguousarray(small.depth, np.float32), 5)
     around = np.ones((_EDGE_PX, _EDGE_PX))
     far, near = cv2.dilate(smooth, around), cv2.erode(np.where(smooth > 0, smooth, np.float32(1e3)), around)
-    v, u = np.mgrid[: gray.shape[0], : gray.shape[1]]
-    points = camera.at(np.eye(4)).unproject(np.stack([u, v], -1) * n + (n - 1) / 2, smooth)
+    points = small.unproject(smooth, (small.factor - 1) / 2)
     points[(smooth <= 0) | (far - near > _EDGE * smooth)] = np.nan
-    return gray, points
+    return small.gray, points
 
 
 def _followed(one: _Taken, other: _Taken, still: bool) -> tuple[np.ndarray, np.ndarray] | None:

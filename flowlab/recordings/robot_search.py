@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float64
 
+from flowlab.recordings.pose_pairs import rotation_between
 from flowlab.recordings.robot_motion import BALL_M, FEWEST, SeenMotion, SeenSteps, nearness_of, steps_off, tolerance_of
 
 _TRIPLES, _KEPT, _MIDDLES = 10000, 100, 5
@@ -29,7 +30,7 @@ def search(seen: SeenSteps, *, scaled: bool) -> Iterator[SeenMotion]:
     triples, step, way, scale = (x[fine] for x in (triples, step, way, scale))
     if not len(triples):
         return
-    R = _rotations(way, step / scale[:, None])
+    R = rotation_between(way, step / scale[:, None])
     off = np.linalg.norm(step / scale[:, None] - np.einsum("nij,nkj->nki", R, way), axis=-1)
     at = np.einsum("nij,nkj->nki", R, seen.at[seen.pair[triples]])
     middles = seen.start[triples] / scale[:, None] - at
@@ -78,12 +79,3 @@ def _alike(step: np.ndarray, way: np.ndarray, tolerance: np.ndarray) -> np.ndarr
         apart = [np.linalg.norm(x[:, one] - x[:, other], axis=-1) for x in (step, way)]
         fine &= np.abs(apart[0] - apart[1]) < tolerance[:, one] + tolerance[:, other]
     return np.asarray(fine)
-
-
-def _rotations(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The rotations (n, 3, 3) that take triples of vectors to others as well as one can."""
-    U, _, Vt = np.linalg.svd(np.einsum("nki,nkj->nij", first, second))
-    sign = np.sign(np.linalg.det(np.einsum("nij,njk->nik", U, Vt)))
-    V = np.swapaxes(Vt, 1, 2).copy()
-    V[:, :, 2] *= sign[:, None]
-    return V @ np.swapaxes(U, 1, 2)

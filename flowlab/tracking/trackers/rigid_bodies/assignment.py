@@ -13,7 +13,7 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 _FRAMES = 24
 """Frames that are looked at."""
-_MOTION_PENALTY = 0.08
+MOTION_PENALTY = 0.08
 """What a motion costs for the share of frames in which it really moves the point: prefers stillness."""
 _REFUTING_FRAMES, _REFUTED = 3, 0.3
 """In how many of the frames the camera looks through where a motion would put a point, so that it is another's
@@ -50,7 +50,7 @@ def motion_costs(
     motions: Sequence[RigidMotion],
     uv: Num[np.ndarray, "n 2"],
     xyz_cam: Float[np.ndarray, "n 3"],
-    motion_penalty: float = _MOTION_PENALTY,
+    motion_penalty: float | Float[np.ndarray, "n"] = MOTION_PENALTY,
 ) -> Float32[np.ndarray, "B n"]:
     """How badly each motion explains points of the first frame, in the mean over the frames.
 
@@ -60,7 +60,7 @@ def motion_costs(
         motions: B of them.
         uv: The points' pixels.
         xyz_cam: Their positions [m].
-        motion_penalty: Cost of moving a point by more than 1 cm in all frames.
+        motion_penalty: Cost of moving a point, or each of them, by more than 1 cm in all frames.
     """
     frames = np.unique(np.linspace(1, len(pictures) - 1, min(len(pictures) - 1, _FRAMES)).round().astype(int))
     features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
@@ -71,7 +71,7 @@ def motion_costs(
         xyz_cam, features, frames, R, t, still.R, still.t, static, pictures.depth, pictures.feature, pictures.K
     )
     refuted = through * len(frames) >= _REFUTING_FRAMES
-    return cost + np.float32(motion_penalty) * moved + np.float32(_REFUTED) * refuted
+    return cost + np.asarray(motion_penalty, np.float32) * moved + np.float32(_REFUTED) * refuted
 
 
 def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMotion]) -> BodyAssignment:

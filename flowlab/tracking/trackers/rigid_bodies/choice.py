@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from flowlab.tracking.trackers.rigid_bodies import _costs
-from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
+from flowlab.tracking.trackers.rigid_bodies.assignment import MOTION_PENALTY, motion_costs
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
 
@@ -67,15 +67,14 @@ def choose_motions(
         followed: Where another tracker does.
     """
     replaced = _replaced(fit.grid, uv)
-    own = motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0])
-    own[:, replaced] = motion_costs(fit.pictures, fit.grid, fit.motions, uv[replaced], paths[0, 0, replaced], 0.0)
+    penalty = np.where(replaced, 0.0, MOTION_PENALTY)
+    own = motion_costs(fit.pictures, fit.grid, fit.motions, uv, paths[0, 0], penalty)
     cost = _picture_costs(fit, uv, z, own, replaced)
     against = cost + _ELSEWHERE * _ramp(cost.min(0), *_BADLY_SHOWN) * _elsewhere(paths, followed)
     unexplained = _ramp(against.min(0), *_UNEXPLAINED)
     doubtful = np.flatnonzero(unexplained)
-    against[:, doubtful] += (
-        _FOREIGN * unexplained[doubtful] * (1 - _taken_around(fit, paths[0, 0, doubtful], replaced[doubtful]))
-    )
+    around = _taken_around(fit, paths[0, 0, doubtful], replaced[doubtful])
+    against[:, doubtful] += _FOREIGN * unexplained[doubtful] * (1 - around)
     motion = against.argmin(0)
     return MotionChoice(motion, cost[motion, np.arange(len(uv))], against.astype(np.float32))
 
