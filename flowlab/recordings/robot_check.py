@@ -28,6 +28,9 @@ _LEAST_WAY_M = 0.015
 """Pairs of pictures between which it goes less tell nothing [m]."""
 _PAIRS = 8
 """So many pairs must agree."""
+_PAIRS_UNPOSED = 12
+"""And so many where nothing is said of how the camera is turned: some turn fit nine pairs of joint angles, of one of
+280 simulated arms."""
 _AGREE, _AGREE_OTHERWISE = 0.35, 0.6
 """And this share of those with points around the gripper, for calibration as it is said, and for another."""
 _CLEARLY = 0.75
@@ -139,14 +142,14 @@ def judge(seen: Seen, T_world_cam: Float64[np.ndarray, "4 4"] | None, write_to: 
         return Check(_ABOUT, Verdict.ASSUMED, _TOO_LITTLE)
     R = None if T_world_cam is None else T_world_cam[:3, :3].T
     at_once = as_said(steps, R)
-    if at_once is not None and _holds(at_once, _CLEARLY) and (R is not None or not _sheared(steps, at_once)):
+    if at_once is not None and _holds_as_said(at_once, _CLEARLY) and (R is not None or not _sheared(steps, at_once)):
         return _as_said(steps, at_once, T_world_cam, write_to)
     found = explanations(steps, R)
     said = next((e for e in found if not e.scaled and e.turned == (R is None)), None)
     most = max((e.support.score for e in found), default=0.0)
     if R is None and said is not None and _sheared(steps, said):
         said = None
-    if said is not None and _holds(said, _AGREE) and said.support.score >= _NEAR_BEST * most:
+    if said is not None and _holds_as_said(said, _AGREE) and said.support.score >= _NEAR_BEST * most:
         return _as_said(steps, said, T_world_cam, write_to)
     return _at_other_times(seen, R, most) or _otherwise(steps, found, said, T_world_cam, write_to)
 
@@ -155,6 +158,16 @@ def _holds(found: Explanation, agree: float) -> bool:
     """Whether enough goes along."""
     support = found.support
     return support.count >= _PAIRS and support.agreement >= agree and support.left <= _LEFT
+
+
+def _holds_as_said(said: Explanation, agree: float) -> bool:
+    """The same of calibration as it is said."""
+    return _holds(said, agree) and said.support.count >= _least(said)
+
+
+def _least(said: Explanation) -> int:
+    """Pairs that must agree with calibration as it is said, which leaves the turn open where there is no pose."""
+    return _PAIRS_UNPOSED if said.turned else _PAIRS
 
 
 def _sheared(steps: SeenSteps, found: Explanation) -> bool:
@@ -282,7 +295,7 @@ def _otherwise(
         if told is not None and not (T is not None and fit.turned and not fit.scaled and _mirrored(steps, fit)):
             goes = f"{_goes(fit)} {_numbers(fit, sure)}" if fit.scaled else _goes(fit)
             return Check(_ABOUT, Verdict.DOUBTFUL, f"{goes} {_AS}{told}; {_correct(write_to)}")
-    if said is not None and said.support.count < _PAIRS and said.support.agreement >= _CLEARLY:
+    if said is not None and said.support.count < _least(said) and said.support.agreement >= _CLEARLY:
         return Check(_ABOUT, Verdict.ASSUMED, _TOO_LITTLE)
     return Check(_ABOUT, Verdict.ASSUMED, "little of what is seen to move goes as the first three numbers of its state "
                  "do: these are no position in meters, the gripper is not seen or goes with the camera, or calibration "

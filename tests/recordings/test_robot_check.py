@@ -94,11 +94,14 @@ def test_a_pose_that_is_a_little_off_is_not_called_right(capsys: Capture, folder
     assert says.endswith("'intrinsics' and 'depth_unit_m' are right to within that")
 
 
-def test_a_clip_of_which_most_agrees_is_too_short_not_wrong(folder: Path) -> None:
-    source = parse_recording(calibrated(folder), RecordingSettings(stop_s=0.85))
-    (found,) = check_robot(source)
-    assert found.verdict is Verdict.ASSUMED
-    assert found.says.startswith("too little is seen to move")
+@pytest.mark.parametrize(("pose", "frames", "told"), [(POSE, 9, False), (POSE, 12, True), (None, 12, False)])
+def test_a_clip_of_which_most_agrees_is_too_short_not_wrong(
+    folder: Path, pose: np.ndarray | None, frames: int, told: bool
+) -> None:
+    settings = RecordingSettings(stop_s=(frames - 0.5) / FPS)
+    (found,) = check_robot(parse_recording(calibrated(folder, T_world_cam=pose), settings))
+    assert found.verdict is (Verdict.OK if told else Verdict.ASSUMED), found.says
+    assert found.says.startswith("too little is seen to move") != told
 
 
 def test_two_numbers_that_are_off_alike_are_not_called_right_by_what_goes_across_the_view() -> None:
