@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _ABOUT = "robot"
 _AS = "as the first three numbers of its state say"
-_TOO_LITTLE = "too little is seen to move while it does to compare calibration with it"
+_TOO_LITTLE = "too little is seen to move while the robot does to compare calibration with that"
 _REACH_M = (0.02, 3.0)
 """A position [m] that a robot's recording has goes so far at least, and at most."""
 _LEAST_WAY_M = 0.015
