@@ -186,6 +186,8 @@ def _look(
     try:
         picture = stream.read(index)
         found = judge(picture)
+        if not found.reason and min(picture.shape[:2]) < shrink_factor(picture):
+            found = _ImageCheck(found.size, f"is {found.size[0]}x{found.size[1]}: too narrow to be of a camera")
         if not keep or found.reason:
             return found
         small = small_gray(picture) if picture.ndim == 3 else small_depth(picture)

@@ -21,12 +21,16 @@ if TYPE_CHECKING:
 
 _ABOUT = "robot"
 _AS = "as the first three numbers of its state say"
+_TOO_LITTLE = "too little is seen to move while the robot does to compare calibration with that"
 _REACH_M = (0.02, 3.0)
 """A position [m] that a robot's recording has goes so far at least, and at most."""
 _LEAST_WAY_M = 0.015
 """Pairs of pictures between which it goes less tell nothing [m]."""
 _PAIRS = 8
 """So many pairs must agree."""
+_PAIRS_UNPOSED = 12
+"""And so many where nothing is said of how the camera is turned: some turn fit nine pairs of joint angles, of one of
+280 simulated arms."""
 _AGREE, _AGREE_OTHERWISE = 0.35, 0.6
 """And this share of those with points around the gripper, for calibration as it is said, and for another."""
 _CLEARLY = 0.75
@@ -49,7 +53,8 @@ _SURE = 0.08
 """A scale that is less sure (one standard deviation) is not told."""
 _FINE, _DOUBTED = 0.1, 0.16
 """Scales (as logarithms) up to which calibration is right, and from which on it is doubtful: flow at the
-rim of a gripper takes off 4 % of its steps, as of 25 tasks, and points of a forearm some more."""
+rim of a gripper takes off 4 % of its steps, as of 25 tasks, and points of a forearm some more. A turn [rad] takes steps
+off by as much: up to the first of these the rotation of T_world_cam is right."""
 _STRONG = (12, 0.7, 0.1)
 """Pairs, their share and what steps are off by, to doubt a scale where nothing is said of how the camera is turned:
 with less, velocities did so once."""
@@ -108,8 +113,8 @@ def check_robot(source: "ParsedRecording") -> Iterator[Check]:
         return
     reach = float(np.ptp(state.values[:, :3].astype(float), axis=0).max())
     if not _REACH_M[0] <= reach <= _REACH_M[1]:
-        yield Check(_ABOUT, Verdict.ASSUMED, f"the first three numbers of its state go over {reach:.3g}, as a "
-                    "position in meters hardly does: nothing compares calibration with how it moves")  # fmt: skip
+        yield Check(_ABOUT, Verdict.ASSUMED, f"the first three numbers of its state go over {reach:.3g}: calibration "
+                    f"is compared with positions that go over {_REACH_M[0]:g} to {_REACH_M[1]:g} m")  # fmt: skip
         return
     seen = Seen(tuple(moving_points(source, state)), state)
     yield judge(seen, _pose_said(source), source.write_to)
@@ -134,17 +139,17 @@ def judge(seen: Seen, T_world_cam: Float64[np.ndarray, "4 4"] | None, write_to: 
     """
     steps = seen.at()
     if len(steps) < _PAIRS:
-        return Check(_ABOUT, Verdict.ASSUMED, "too little is seen to move while it does to compare calibration with it")
+        return Check(_ABOUT, Verdict.ASSUMED, _TOO_LITTLE)
     R = None if T_world_cam is None else T_world_cam[:3, :3].T
     at_once = as_said(steps, R)
-    if at_once is not None and _holds(at_once, _CLEARLY) and (R is not None or not _sheared(steps, at_once)):
+    if at_once is not None and _holds_as_said(at_once, _CLEARLY) and (R is not None or not _sheared(steps, at_once)):
         return _as_said(steps, at_once, T_world_cam, write_to)
     found = explanations(steps, R)
     said = next((e for e in found if not e.scaled and e.turned == (R is None)), None)
     most = max((e.support.score for e in found), default=0.0)
     if R is None and said is not None and _sheared(steps, said):
         said = None
-    if said is not None and _holds(said, _AGREE) and said.support.score >= _NEAR_BEST * most:
+    if said is not None and _holds_as_said(said, _AGREE) and said.support.score >= _NEAR_BEST * most:
         return _as_said(steps, said, T_world_cam, write_to)
     return _at_other_times(seen, R, most) or _otherwise(steps, found, said, T_world_cam, write_to)
 
@@ -153,6 +158,16 @@ def _holds(found: Explanation, agree: float) -> bool:
     """Whether enough goes along."""
     support = found.support
     return support.count >= _PAIRS and support.agreement >= agree and support.left <= _LEFT
+
+
+def _holds_as_said(said: Explanation, agree: float) -> bool:
+    """The same of calibration as it is said."""
+    return _holds(said, agree) and said.support.count >= _least(said)
+
+
+def _least(said: Explanation) -> int:
+    """Pairs that must agree with calibration as it is said, which leaves the turn open where there is no pose."""
+    return _PAIRS_UNPOSED if said.turned else _PAIRS
 
 
 def _sheared(steps: SeenSteps, found: Explanation) -> bool:
@@ -184,22 +199,26 @@ def _as_said(steps: SeenSteps, said: Explanation, T: np.ndarray | None, write_to
         return Check(_ABOUT, Verdict.DOUBTFUL, f"{_goes(fit)} {numbers} {_AS}, but {away:.2f} m from there: "
                      f"T_world_cam is not of their frame, or its position is wrong; {_correct(write_to)}")  # fmt: skip
     turned, of = _turned_by(steps, fit, T)
-    off = max(abs(np.log(motion.across)), abs(np.log(motion.along)) if sure.along <= _SURE else 0.0)
+    deep = sure.along <= _SURE
+    off = max(abs(np.log(motion.across)), abs(np.log(motion.along)) if deep else 0.0)
     says = f"{_goes(fit)} {numbers} {_AS}{turned}"
     if off > _FINE:
         return Check(_ABOUT, Verdict.ASSUMED, f"{says}: {of} may be off by as much, or flow is")
-    return Check(_ABOUT, Verdict.OK, f"{says}: {of} are right to within that")
+    unless = "" if deep else ", unless focal length and unit are off alike: little goes along the view"
+    return Check(_ABOUT, Verdict.OK, f"{says}: {of} are right to within that{unless}")
 
 
 def _turned_by(steps: SeenSteps, said: Explanation, T: np.ndarray | None) -> tuple[str, str]:
     """By how much what moves is turned against T_world_cam, in words, where that is told; and what is right then."""
-    if T is not None:
-        motion, support = refined(steps, said.motion)
-        angle = turn_between(motion.R_cam_base, T[:3, :3].T)
-        if sureness(steps, motion, support).turn_rad < _TURN_SURE_RAD:
-            says = f", turned by {np.degrees(angle):.0f} degrees against T_world_cam"
-            return says, "'intrinsics', 'depth_unit_m' and T_world_cam"
-    return "", "'intrinsics' and 'depth_unit_m'"
+    of = "'intrinsics' and 'depth_unit_m'"
+    if T is None:
+        return "", of
+    motion, support = refined(steps, said.motion)
+    if sureness(steps, motion, support).turn_rad >= _TURN_SURE_RAD:
+        return "", of
+    angle = turn_between(motion.R_cam_base, T[:3, :3].T)
+    says = f", turned by {np.degrees(angle):.0f} degrees against T_world_cam"
+    return (f"{says}, which may be off by as much", of) if angle > _FINE else (says, f"its rotation, {of}")
 
 
 def _correct(write_to: str) -> str:
@@ -276,8 +295,11 @@ def _otherwise(
         if told is not None and not (T is not None and fit.turned and not fit.scaled and _mirrored(steps, fit)):
             goes = f"{_goes(fit)} {_numbers(fit, sure)}" if fit.scaled else _goes(fit)
             return Check(_ABOUT, Verdict.DOUBTFUL, f"{goes} {_AS}{told}; {_correct(write_to)}")
+    if said is not None and said.support.count < _least(said) and said.support.agreement >= _CLEARLY:
+        return Check(_ABOUT, Verdict.ASSUMED, _TOO_LITTLE)
     return Check(_ABOUT, Verdict.ASSUMED, "little of what is seen to move goes as the first three numbers of its state "
-                 "do: these are no position in meters, or the gripper is not seen")  # fmt: skip
+                 "do: these are no position in meters, the gripper is not seen or goes with the camera, or calibration "
+                 "is off in a way that this does not tell")  # fmt: skip
 
 
 def _told(fit: Explanation, sure: Sureness, T: np.ndarray | None) -> str | None:

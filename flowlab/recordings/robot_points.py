@@ -37,6 +37,9 @@ _EDGE, _EDGE_PX = 0.04, 7
 """Depth that differs by this share within so many pixels has an edge there, where flow mixes both sides."""
 _MOVED_PX, _MOVED_SHARE = 1.0, 0.02
 """What moves by less in the picture and by less of its distance does not move, as far as is seen."""
+_BEFORE_CAMERA = 0.7
+"""Before a camera that moves, points must go at least this share of their step: the rest its poses say, whatever
+calibration is, and all of it of a gripper whose wrist the camera is on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,5 +192,6 @@ def _before_first_camera(
     back = inverse(T[0])
     first, second = (apply(back @ T[row], xyz) for row, xyz in zip(rows, (start, end), strict=True))
     step = second - first
-    moves = np.linalg.norm(step, axis=1) > _MOVED_SHARE * start[:, 2]
+    far = np.linalg.norm(step, axis=1)
+    moves = (far > _MOVED_SHARE * start[:, 2]) & (np.linalg.norm(end - start, axis=1) > _BEFORE_CAMERA * far)
     return first[moves], step[moves]

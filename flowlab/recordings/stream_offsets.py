@@ -40,8 +40,9 @@ def check_offsets(
     found = [check_offset("depth", lag, "depth_offset_s", stated.get("depth"), refusable=True)]
     for s in streams.state[:1]:
         if len(s.time_s) > 1 and s.values.shape[1]:
-            reach = np.maximum(np.ptp(s.values, axis=0), 1e-9)
-            change = np.linalg.norm(np.diff(s.values, axis=0) / reach, axis=1).astype(np.float64)
+            values = s.values.astype(np.float64)  # of float32, what it goes over may be too large for that
+            reach = np.maximum(np.ptp(values, axis=0), 1e-9)
+            change = np.linalg.norm(np.diff(values, axis=0) / reach, axis=1)
             offset = find_offset(pictures, Motion.make("the robot", s.time_s, change))
             found.append(check_offset("the robot", offset, "state_offset_s", stated.get("state")))
     return tuple(found)

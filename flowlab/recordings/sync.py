@@ -62,13 +62,20 @@ def _overlaps(
 
 
 def sampling_rate(time_s: Float64[np.ndarray, "N"]) -> float:
-    """Samples per second, by the median interval; 0 for fewer than two."""
-    return float(1 / np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    """Samples per second, by the median interval between different times; 0 for fewer than two of these."""
+    step = _usual_step(time_s)
+    return 1 / step if step else 0.0
 
 
 def find_gaps(time_s: Float64[np.ndarray, "N"]) -> tuple[tuple[float, float], ...]:
     """Start and length [s] of every interval that is longer than ``GAP`` median ones."""
-    interval = np.diff(time_s)
+    interval, usual = np.diff(time_s), _usual_step(time_s)
     if len(interval) < 2:
         return ()
-    return tuple((float(time_s[i]), float(interval[i])) for i in np.flatnonzero(interval > GAP * np.median(interval)))
+    return tuple((float(time_s[i]), float(interval[i])) for i in np.flatnonzero(interval > GAP * usual))
+
+
+def _usual_step(time_s: Float64[np.ndarray, "N"]) -> float:
+    """The median interval [s] between different times, of which samples may share one; 0 where there is none."""
+    interval = np.diff(time_s)
+    return float(np.median(interval[interval > 0])) if (interval > 0).any() else 0.0

@@ -8,6 +8,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -86,11 +87,24 @@ class TestPictures:
         assert [b.name for b in bad] == ["color/0002.png"]
         assert bad[0].reason.startswith("cannot be read (")
 
+    def test_pictures_too_narrow_to_be_shrunk_are_named(self, tmp_path: Path) -> None:
+        path = write_folder(tmp_path / "r")
+        for k in range(6):
+            cv2.imwrite(str(path / "color" / f"{k:04d}.png"), np.full((1, 640, 3), k, np.uint8))
+        with pytest.raises(DataError, match=r"color/0000\.png is 640x1: too narrow"):
+            opened(path)
+
 
 def _yaml(**keys: Any) -> Spoil:
     return lambda path: write_yaml(
         path / "recording.yaml", **{"fps": 10, "depth_unit_m": 0.001, "intrinsics": INTRINSICS, **keys}
     )
+
+
+def test_a_state_as_large_as_float32_can_be_prints_no_warning(tmp_path: Path) -> None:
+    np.save(write_folder(tmp_path / "r", state="state.npy") / "state.npy", np.float32([[3e38] * 3, [-3e38] * 3] * 3))
+    with warnings.catch_warnings(action="error"):
+        opened(tmp_path / "r")
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from dry_runs import dry_run
 from filmed_scenes import FLOOR, TABLE, THINGS, WALL, Box, film, looking
 from real_recordings import write_png, write_yaml
 
+from flowlab.recordings.base import SampleStream
 from flowlab.recordings.parsing import RecordingSettings, parse_recording
-from flowlab.recordings.robot_check import check_robot
+from flowlab.recordings.robot_check import Seen, check_robot, judge
+from flowlab.recordings.robot_points import MovingPoints
 from flowlab.recordings.verdicts import Verdict
 
 Capture = pytest.CaptureFixture[str]
@@ -60,7 +63,7 @@ def test_what_moves_as_the_state_says_is_evidence(capsys: Capture, folder: Path,
     across, along = (float(says.split(f" times {where}")[0].split()[-1]) for where in ("as far across", "along it"))
     assert abs(across - 1) < 0.06
     assert abs(along - 1) < 0.06
-    assert ("T_world_cam" in says) == (pose is not None)
+    assert ("its rotation, 'intrinsics' and 'depth_unit_m' are right" in says) == (pose is not None)
 
 
 @pytest.mark.parametrize(
@@ -80,6 +83,62 @@ def test_what_moves_otherwise_tells_which_number_is_wrong(
     assert verdict == "doubtful", says
     assert words in says
     assert "recording.yaml" in says
+
+
+def test_a_pose_that_is_a_little_off_is_not_called_right(capsys: Capture, folder: Path) -> None:
+    a = np.radians(7)
+    roll = np.array([[np.cos(a), -np.sin(a), 0, 0], [np.sin(a), np.cos(a), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    verdict, says = dry_run(capsys, calibrated(folder, T_world_cam=POSE @ roll)).checks["robot"]
+    assert verdict == "ok", says
+    assert "turned by 7 degrees against T_world_cam, which may be off by as much" in says
+    assert says.endswith("'intrinsics' and 'depth_unit_m' are right to within that")
+
+
+@pytest.mark.parametrize(("pose", "frames", "told"), [(POSE, 9, False), (POSE, 12, True), (None, 12, False)])
+def test_a_clip_of_which_most_agrees_is_too_short_not_wrong(
+    folder: Path, pose: np.ndarray | None, frames: int, told: bool
+) -> None:
+    settings = RecordingSettings(stop_s=(frames - 0.5) / FPS)
+    (found,) = check_robot(parse_recording(calibrated(folder, T_world_cam=pose), settings))
+    assert found.verdict is (Verdict.OK if told else Verdict.ASSUMED), found.says
+    assert found.says.startswith("too little is seen to move") != told
+
+
+def test_two_numbers_that_are_off_alike_are_not_called_right_by_what_goes_across_the_view() -> None:
+    rng, alike = np.random.default_rng(0), 1.5
+    time_s = np.arange(60) / FPS
+    way = 0.2 * np.stack([np.sin(time_s), np.cos(1.7 * time_s), 0 * time_s], -1)
+    body = rng.uniform(-0.05, 0.05, (20, 3)) + np.array([0, 0, 0.8])
+    points = []
+    for k in range(0, 55, 2):
+        true = [body + way[j] for j in (k, k + 2)]
+        start, end = (p * [1, 1, alike] for p in true)  # as (x, y) of unit / focal length * depth
+        points.append(MovingPoints((time_s[k], time_s[k + 2]), start, end - start + rng.normal(0, 1e-3, start.shape)))
+    T_world_cam = np.eye(4) - [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0.8], [0, 0, 0, 0]]
+    found = judge(Seen(tuple(points), SampleStream("state", time_s, way)), T_world_cam, "recording.yaml")
+    assert found.verdict is Verdict.OK, found.says
+    assert found.says.endswith("are right to within that, unless focal length and unit are off alike: little goes "
+                               "along the view")  # fmt: skip
+
+
+def test_a_gripper_before_a_camera_at_its_wrist_is_no_evidence(tmp_path: Path) -> None:
+    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (60, 80, 3)).astype(np.uint8), (0, 0), 1.0)
+    depth = np.zeros((60, 80), np.uint16)
+    depth[15:50, 20:65] = round(0.3 / UNIT_M)
+    for k in range(FRAMES):
+        noise = np.random.default_rng(k).integers(0, 4, texture.shape).astype(np.uint8)
+        write_png(tmp_path / "color" / f"{k:04d}.png", cv2.add(texture, noise))
+        write_png(tmp_path / "depth" / f"{k:04d}.png", depth + noise[..., 0] * (depth > 0))
+    poses = np.tile(POSE, (FRAMES, 1, 1))
+    poses[:, :3, 3] += _WAY
+    np.save(tmp_path / "T.npy", poses)
+    np.save(tmp_path / "state.npy", poses[:, :3, 3] + 0.3 * POSE[:3, 2])
+    for focal in (75.0, 105.0):  # whatever it is, what stays in the picture goes as the poses
+        about = {"fps": FPS, "depth_unit_m": UNIT_M, "state": "state.npy", "T_world_cam_file": "T.npy"}
+        camera = {"fx": focal, "fy": focal, "cx": 39.5, "cy": 29.5}
+        write_yaml(tmp_path / "recording.yaml", **about, intrinsics=camera)
+        (found,) = check_robot(parse_recording(tmp_path, RecordingSettings()))
+        assert found.verdict is Verdict.ASSUMED, found.says
 
 
 def test_a_wrong_focal_length_is_told_without_a_pose_too(folder: Path) -> None:
@@ -102,6 +161,7 @@ _OTHER_STATES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "millimeters": lambda p: 1000 * p,
     "velocities": lambda p: np.gradient(p, 1 / FPS, axis=0),
     "0.3 s late": lambda p: np.roll(p, 3, axis=0),
+    "a robot that stands still": lambda p: 0 * p + p[0],
 }
 
 

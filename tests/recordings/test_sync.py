@@ -50,6 +50,13 @@ def test_a_jittering_stream_has_no_gaps() -> None:
     assert sampling_rate(time_s) == pytest.approx(30, rel=0.05)
 
 
+def test_rows_that_share_their_times_are_no_gaps_and_have_a_rate() -> None:
+    time_s = np.repeat(np.arange(20) / 10, 2)
+    assert find_gaps(time_s) == ()
+    assert sampling_rate(time_s) == pytest.approx(10)
+    assert sampling_rate(np.ones(5)) == 0
+
+
 def test_one_sample_is_near_to_all_and_has_no_rate() -> None:
     np.testing.assert_array_equal(nearest_sample(np.arange(3.0), np.array([9.0])), 0)
     np.testing.assert_array_equal(last_sample(np.arange(3.0), np.array([9.0])), 0)
