@@ -22,8 +22,8 @@ def choice(
 
 @pytest.fixture(scope="module")
 def speckled() -> tuple[Scene, np.ndarray, list[RigidMotion]]:
-    """Points of a plate that look otherwise in the first picture than later, so that to be hidden costs less than to be
-    seen; how the plate moves, and a motion that takes it behind what is in front, where nothing can contradict."""
+    """Points of a plate that look otherwise in the first picture than later, so that to be hidden costs hardly more
+    than to be seen; how the plate moves, and a motion that takes it behind the rest, where nothing can contradict."""
     base = two_plates()
     uv = base.some_pixels(1, 12, border=10)
     rgb = base.clip.rgb.copy()
@@ -35,8 +35,8 @@ def speckled() -> tuple[Scene, np.ndarray, list[RigidMotion]]:
     return seen, uv, [true, RigidMotion(true.R, true.t + back)]
 
 
-HIDDEN = 0.6 + 0.08
-"""What it costs to be taken away and hidden in all frames."""
+HIDDEN, UNEXPLAINED = 0.6 + 0.08, 0.62
+"""What it costs to be taken away and hidden in all frames, and a cost at which the pictures alone no longer tell."""
 
 
 def test_a_point_that_nothing_explains_goes_where_it_was_followed(
@@ -45,8 +45,8 @@ def test_a_point_that_nothing_explains_goes_where_it_was_followed(
     seen, uv, motions = speckled
     for k in (1, 2):
         found = choice(seen, uv, motions, motions[k - 1].apply(seen.points(uv)))
-        assert (found.motion == k)[found.cost > HIDDEN - 0.01].all()
-        assert (found.cost > HIDDEN - 0.01).sum() > 2
+        assert (found.motion == k)[found.cost > UNEXPLAINED].all()
+        assert (found.cost > UNEXPLAINED).sum() > 2
 
 
 def test_a_point_that_was_hardly_followed_is_judged_by_the_pictures_alone(
@@ -65,7 +65,9 @@ def test_a_point_that_nothing_explains_goes_with_what_is_around_it(
     seen, uv, motions = speckled
     found = choice(seen, uv, motions, motions[1].apply(seen.points(uv)), believed=False)
     assert (found.motion == 1).mean() > 0.9
-    assert ((found.motion == 1) & (found.cost > HIDDEN)).sum() > 2
+    unexplained = found.cost > UNEXPLAINED
+    assert unexplained.sum() > 2
+    assert (found.against[2, unexplained] > HIDDEN + 0.005).all()
 
 
 def test_what_the_pictures_explain_does_not_go_where_it_was_followed() -> None:

@@ -11,7 +11,7 @@ from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
-from flowlab.tracking.trackers.rigid_bodies.assignment import motion_costs
+from flowlab.tracking.trackers.rigid_bodies.assignment import frame_costs, looked_at, motion_costs
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
 from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY
 
@@ -154,6 +154,39 @@ def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:
         path = np.stack([m.apply(scene.points(uv)) for m in motions])
         away = np.linalg.norm(path[:, 1:] - path[:, :1], axis=-1) > 0.01
         np.testing.assert_allclose(moved, away.mean(1), atol=1.01 / len(frames))  # at the limit, rounding decides
+
+
+def test_what_something_thin_lies_on_is_hidden_at_worst_but_where_it_should_rest_another_color_speaks_against_it() -> (
+    None
+):
+    """A finger on a thing is less than a centimeter thick, so that depth alone does not tell that it hides it."""
+    scene, free = two_plates(), 0.0
+    feature = scene.pictures.feature.copy()
+    feature[4:] = 255 - feature[4:]
+    pictures, grid = replace(scene.pictures, feature=feature), segment_motion(scene.pictures)
+    uv, rests = scene.some_pixels(1, 100), scene.some_pixels(0, 100)
+    covered = motion_costs(pictures, grid, [scene.motion(1)], uv, scene.points(uv), free)
+    assert 0.3 < np.median(covered) <= _costs.UNSEEN
+    other = motion_costs(pictures, grid, [scene.motion(0)], rests, scene.points(rests), free)
+    assert np.median(other) > np.median(covered)
+
+
+def test_the_cost_of_a_frame_is_that_of_all_of_them_in_the_mean() -> None:
+    scene = two_plates()
+    uv, motions, grid = scene.some_pixels(1, 50), [scene.motion(k) for k in range(3)], segment_motion(scene.pictures)
+    frames = looked_at(scene.pictures)
+    every = frame_costs(scene.pictures, grid, motions, uv, scene.points(uv), frames)
+    assert every.shape == (3, len(frames))
+    R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
+    features = _costs.features_at(scene.pictures.feature[0], uv.astype(np.float32))
+    shown = scene.pictures.depth, scene.pictures.feature, scene.pictures.K
+    still = scene.pictures.stillness
+    static = grid.in_pixels(grid.static, scene.owner.shape)
+    cost, *_ = _costs.motion_costs(scene.points(uv), features, frames, R, t, still.R, still.t, static, *shown)
+    np.testing.assert_allclose(every[1:].mean(1), cost[1:].mean(1), atol=1e-5)
+    assert (
+        every[0].mean() <= cost[0].mean() + 1e-5
+    )  # a covered point that rests costs more where it was last seen badly
 
 
 def test_what_fits_leaves_no_residual_and_without_depth_none_is_known() -> None:

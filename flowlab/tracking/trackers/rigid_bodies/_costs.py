@@ -20,9 +20,10 @@ BLACK, GRAY = 16 * 2.55, 128
 SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
 """Cost of a body's point where the camera looks through it, where something is in front, and where depth is missing."""
 
-BACKGROUND, AS_WELL, COVERED = 0.6, 0.05, 0.4
-"""Least cost of a moved point where the picture shows, as well but for so much, what stood there before; and cost of a
-point that rests, beyond that at which it was last seen, where something came in front."""
+UNSEEN, AS_WELL, COVERED = 0.6, 0.05, 0.4
+"""Cost of a moved point that is hidden: as much as where the picture shows, as well but for so much, what stood there
+before, and all that another color costs, for a finger may lie on it. And cost of a point that rests, beyond that at
+which it was last seen, where something came in front."""
 
 
 @numba.njit(cache=True, inline="always")
@@ -152,20 +153,34 @@ def motion_costs(points, point_features, frames, R, t, still_R, still_t, static,
                 elif off < tolerance(z):
                     color = color_cost(feature[f], u, v, point_features[k], SHADED)
                     here = 0.7 * color + 0.35 * min(off / (0.6 * tolerance(z)), 1.0)
-                    if away and here < BACKGROUND:
+                    if away and here < UNSEEN:
                         before = _background_cost(x, still_R[f], still_t[f], static, depth[0], feature, f, u, v, K)
                         if before < color + AS_WELL:
-                            here = BACKGROUND
+                            here = UNSEEN
+                    elif away:
+                        here = UNSEEN
                     last[b, k] = here
                     cost[b, k] += here
                 elif nearest > z:
                     cost[b, k] += 1.4
                     through[b, k] += share
                 elif away:
-                    cost[b, k] += 0.6
+                    cost[b, k] += UNSEEN
                 else:
-                    cost[b, k] += min(COVERED + last[b, k], 0.6)
+                    cost[b, k] += min(COVERED + last[b, k], UNSEEN)
     return cost * np.float32(share), moved, through
+
+
+@numba.njit(cache=True)
+def frame_costs(points, point_features, frames, R, t, still_R, still_t, static, depth, feature, K) -> np.ndarray:
+    """The mean cost (B, F) of motions over the points in each of some frames: see :func:`motion_costs`."""
+    cost = np.zeros((len(R), len(frames)), np.float32)
+    for f in range(len(frames)):
+        at = frames[f : f + 1]
+        here = motion_costs(points, point_features, at, R, t, still_R, still_t, static, depth, feature, K)[0]
+        for b in range(len(R)):
+            cost[b, f] = here[b].mean()
+    return cost
 
 
 @numba.njit(cache=True, inline="always")

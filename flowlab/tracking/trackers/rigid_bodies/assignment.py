@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64, Num
+from jaxtyping import Float, Float32, Float64, Int64, Num
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
@@ -62,16 +62,43 @@ def motion_costs(
         xyz_cam: Their positions [m].
         motion_penalty: Cost of moving a point, or each of them, by more than 1 cm in all frames.
     """
-    frames = np.unique(np.linspace(1, len(pictures) - 1, min(len(pictures) - 1, _FRAMES)).round().astype(int))
-    features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
-    R, t = np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
-    static = grid.in_pixels(grid.static, pictures.depth.shape[1:])
-    still = pictures.stillness
-    cost, moved, through = _costs.motion_costs(
-        xyz_cam, features, frames, R, t, still.R, still.t, static, pictures.depth, pictures.feature, pictures.K
-    )
+    what, shown = _compared(pictures, grid, uv, xyz_cam)
+    frames = looked_at(pictures)
+    cost, moved, through = _costs.motion_costs(*what, frames, *_poses(motions), *shown)
     refuted = through * len(frames) >= _REFUTING_FRAMES
     return cost + np.asarray(motion_penalty, np.float32) * moved + np.float32(_REFUTED) * refuted
+
+
+def frame_costs(
+    pictures: ClipFeatures,
+    grid: MotionGrid,
+    motions: Sequence[RigidMotion],
+    uv: Num[np.ndarray, "n 2"],
+    xyz_cam: Float[np.ndarray, "n 3"],
+    frames: Int64[np.ndarray, "F"],
+) -> Float32[np.ndarray, "B F"]:
+    """How badly each motion explains points of the first frame in each of some frames, in the mean over the points."""
+    what, shown = _compared(pictures, grid, uv, xyz_cam)
+    return np.asarray(_costs.frame_costs(*what, frames, *_poses(motions), *shown))
+
+
+def looked_at(pictures: ClipFeatures) -> Int64[np.ndarray, "F"]:
+    """The frames by which motions are judged."""
+    return np.unique(np.linspace(1, len(pictures) - 1, min(len(pictures) - 1, _FRAMES)).round().astype(int))
+
+
+def _poses(motions: Sequence[RigidMotion]) -> tuple[Float64[np.ndarray, "B T 3 3"], Float64[np.ndarray, "B T 3"]]:
+    return np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
+
+
+def _compared(
+    pictures: ClipFeatures, grid: MotionGrid, uv: np.ndarray, xyz_cam: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """What is compared, points with their features, and with what: the pictures, and what stands still in them."""
+    features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
+    static = grid.in_pixels(grid.static, pictures.depth.shape[1:])
+    still = pictures.stillness
+    return (xyz_cam, features), (still.R, still.t, static, pictures.depth, pictures.feature, pictures.K)
 
 
 def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMotion]) -> BodyAssignment:

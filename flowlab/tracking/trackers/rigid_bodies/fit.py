@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import assign
+from flowlab.tracking.trackers.rigid_bodies.attachment import attached_bodies
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, changed_body, new_body
 from flowlab.tracking.trackers.rigid_bodies.camera_motion import with_camera_motion
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
@@ -37,6 +38,7 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
         bodies = _refit(RigidBodyFit.with_needed(pictures, grid, bodies), rng)
         if k < _ROUNDS - 1:
             bodies += track_poses(pictures, _bodies_of_unexplained(pictures, grid, bodies), rng)
+            bodies += _attached(pictures, grid, bodies, rng)
     fit = RigidBodyFit.with_needed(pictures, grid, bodies)
     for _ in range(_MERGE_ROUNDS):
         merged = merge(fit, rng)
@@ -64,6 +66,14 @@ def _bodies_of_unexplained(pictures: ClipFeatures, grid: MotionGrid, bodies: lis
     room = max(_MAX_BODIES - len(bodies), 0)
     parts = [m for m in grid.components(unexplained) if m.sum() >= 7][: min(6, room)]
     return [new_body(pictures, grid, m) for m in parts]
+
+
+def _attached(
+    pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody], rng: np.random.Generator
+) -> list[RigidBody]:
+    """Things that others take along: moving as these do, and aligned to what pictures show of them, too."""
+    found = attached_bodies(pictures, grid, bodies, assign(pictures, grid, [b.motion for b in bodies]))
+    return [*found, *track_poses(pictures, found, rng)]
 
 
 def _refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
