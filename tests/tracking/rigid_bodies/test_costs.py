@@ -156,18 +156,16 @@ def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:
         np.testing.assert_allclose(moved, away.mean(1), atol=1.01 / len(frames))  # at the limit, rounding decides
 
 
-def test_what_something_thin_lies_on_is_hidden_at_worst_but_where_it_should_rest_another_color_speaks_against_it() -> (
-    None
-):
+def test_another_color_at_a_moved_point_costs_what_being_hidden_does_at_most() -> None:
     """A finger on a thing is less than a centimeter thick, so that depth alone does not tell that it hides it."""
-    scene, free = two_plates(), 0.0
+    scene, penalty = two_plates(), 0.0
     feature = scene.pictures.feature.copy()
     feature[4:] = 255 - feature[4:]
     pictures, grid = replace(scene.pictures, feature=feature), segment_motion(scene.pictures)
     uv, rests = scene.some_pixels(1, 100), scene.some_pixels(0, 100)
-    covered = motion_costs(pictures, grid, [scene.motion(1)], uv, scene.points(uv), free)
+    covered = motion_costs(pictures, grid, [scene.motion(1)], uv, scene.points(uv), penalty)
     assert 0.3 < np.median(covered) <= _costs.UNSEEN
-    other = motion_costs(pictures, grid, [scene.motion(0)], rests, scene.points(rests), free)
+    other = motion_costs(pictures, grid, [scene.motion(0)], rests, scene.points(rests), penalty)
     assert np.median(other) > np.median(covered)
 
 
@@ -184,9 +182,8 @@ def test_the_cost_of_a_frame_is_that_of_all_of_them_in_the_mean() -> None:
     static = grid.in_pixels(grid.static, scene.owner.shape)
     cost, *_ = _costs.motion_costs(scene.points(uv), features, frames, R, t, still.R, still.t, static, *shown)
     np.testing.assert_allclose(every[1:].mean(1), cost[1:].mean(1), atol=1e-5)
-    assert (
-        every[0].mean() <= cost[0].mean() + 1e-5
-    )  # a covered point that rests costs more where it was last seen badly
+    # A covered point that rests costs more where it was last seen badly, which a single frame does not know.
+    assert every[0].mean() <= cost[0].mean() + 1e-5
 
 
 def test_what_fits_leaves_no_residual_and_without_depth_none_is_known() -> None:
