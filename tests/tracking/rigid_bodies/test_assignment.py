@@ -76,10 +76,17 @@ def test_a_motion_of_no_cell_is_not_needed() -> None:
     assert select_needed(volume((0.9, 0.1, 0.5), (0.1, 0.9, 0.5), (0.8, 0.2, 0.6))) == [0, 1]
 
 
+def test_of_two_motions_of_many_cells_the_right_one_is_needed_though_each_costs_little_more_without_it() -> None:
+    #                 still, right, wrong, which is another small thing's own
+    rows = [(0.9, 0.30, 0.345)] * 600 + [(0.9, 0.6, 0.4)] * 30
+    assert select_needed(volume(*rows)) == [0, 1, 2]
+    assert select_needed(volume(*rows[:20], *rows[-30:])) == [0, 2]  # of few cells, so little says nothing
+
+
 @settings(deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(1, 6), st.just(3), st.just(4)), elements=st.floats(0, 1, width=32)))
-def test_what_is_kept_is_stillness_and_what_gains_by_more_than_the_margin(cost: np.ndarray) -> None:
-    kept = select_needed(BodyAssignment(cost, cost), margin=0.1)
+def test_what_is_kept_is_stillness_and_what_gains_by_more_than_it_must(cost: np.ndarray) -> None:
+    kept = select_needed(BodyAssignment(cost, cost))
     assert kept[0] == 0
     assert kept == sorted(set(kept))
     assert len(kept) >= min(2, len(cost))
@@ -88,4 +95,4 @@ def test_what_is_kept_is_stillness_and_what_gains_by_more_than_the_margin(cost: 
         best, second = np.partition(left.reshape(len(kept), -1), 1, axis=0)[:2]
         owner = left.reshape(len(kept), -1).argmin(0)
         for k in range(1, len(kept)):
-            assert (second - best)[owner == k].mean() > 0.1
+            assert (second - best)[owner == k].mean() > 0.0999  # of up to a hundred cells

@@ -1,12 +1,14 @@
 """Bodies that are one are merged, and others are not."""
 
+from dataclasses import replace
+
 import moving_planes
 import numpy as np
 from rigid_body_scenes import Scene, scene, two_plates
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, new_body, region_pixels
-from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies
+from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies, refit
 from flowlab.tracking.trackers.rigid_bodies.merging import merge, neighbors
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import MotionGrid, segment_motion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
@@ -100,6 +102,20 @@ def test_a_small_region_is_all_of_its_pixels_and_a_large_one_keeps_off_edges() -
     body = new_body(plates.pictures, grid, small)
     assert not body.guessed.any()
     np.testing.assert_array_equal(body.pixels, found)
+
+
+def test_a_body_that_won_cells_of_what_stands_still_keeps_its_motion() -> None:
+    plates = two_plates()
+    wrong = np.where(plates.owner_of_cell == 0, 1, 0)
+    fit = fit_of(plates, wrong, [plates.motion(1)])
+    fit = replace(fit, bodies=(replace(fit.bodies[0], region=plates.owner_of_cell == 1),))
+    bodies = refit(fit, np.random.default_rng(0))
+    assert len(bodies) == 2  # as it is tracked by them, and as it was
+    points = plates.points(plates.some_pixels(1, 50))
+    truth = plates.motion(1).apply(points)
+    needed = RigidBodyFit.with_needed(plates.pictures, fit.grid, bodies)
+    off = [np.linalg.norm(m.apply(points) - truth, axis=-1).max() for m in needed.motions]
+    assert min(off) < 1e-9
 
 
 def test_the_whole_fit_finds_the_plates_and_which_cells_are_theirs() -> None:

@@ -18,6 +18,9 @@ MOTION_PENALTY = 0.08
 _REFUTING_FRAMES, _REFUTED = 3, 0.3
 """In how many of the frames the camera looks through where a motion would put a point, so that it is another's
 whatever the mean says, and what it costs."""
+_NEEDED = 0.03, 0.10
+"""How much more its cells must cost without a motion, in the mean, for it to be kept: the second where there are up to
+a hundred, and less the more there are, as a mean over many errs less, down to the first."""
 _UNKNOWN_COST = 0.9
 _DOUBTFUL, _DOUBTED_COST, _SPREADS, _PLAIN_SCALE = 0.2, 0.5, 5, 0.08
 """Cells whose best motions differ by less, and of which one explains them, take the cost of their surroundings of the
@@ -133,12 +136,11 @@ def _decide_by_surroundings(raw: np.ndarray, cost: np.ndarray, grid: MotionGrid,
     cost[:, open_to_doubt] = raw[:, open_to_doubt] = settled[:, open_to_doubt]
 
 
-def select_needed(assignment: BodyAssignment, margin: float = 0.10) -> list[int]:
+def select_needed(assignment: BodyAssignment) -> list[int]:
     """The motions worth having: dropped, one by one, is what costs its cells little to do without.
 
     Args:
         assignment: What every motion costs.
-        margin: How much more its cells must cost without a motion, in the mean, for it to be kept.
 
     Returns:
         Indices of the motions to keep, stillness and at least one more among them, where there is one.
@@ -149,9 +151,11 @@ def select_needed(assignment: BodyAssignment, margin: float = 0.10) -> list[int]
         valid = np.isfinite(cost[0])
         best, second = np.partition(cost[:, valid], 1, axis=0)[:2]
         owner, gain = cost[:, valid].argmin(0), second - best
-        worth = [gain[owner == k].mean() if (owner == k).any() else 0.0 for k in range(1, len(kept))]
-        least = int(np.argmin(worth))
-        if worth[least] > margin:
+        cells = np.bincount(owner, minlength=len(kept))[1:].clip(1)
+        worth = np.bincount(owner, gain, len(kept))[1:] / cells
+        needed = np.clip(1 / np.sqrt(cells), *_NEEDED)
+        least = int(np.argmin(worth / needed))
+        if worth[least] > needed[least]:
             break
         kept.pop(1 + least)
     return kept

@@ -35,7 +35,7 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
     proposed = [RigidBody(p.pixels, p.motion, p.known) for p in propose_motions(seeds, _MAX_PROPOSALS, rng)]
     bodies = track_poses(pictures, [*_small_moved_bodies(pictures, grid), *proposed], rng)
     for k in range(_ROUNDS):
-        bodies = _refit(RigidBodyFit.with_needed(pictures, grid, bodies), rng)
+        bodies = refit(RigidBodyFit.with_needed(pictures, grid, bodies), rng)
         if k < _ROUNDS - 1:
             bodies += track_poses(pictures, _bodies_of_unexplained(pictures, grid, bodies), rng)
             bodies += _attached(pictures, grid, bodies, rng)
@@ -45,7 +45,7 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
         if merged is None:
             break
         fit = merged
-    return RigidBodyFit.with_needed(pictures, grid, _refit(fit, rng))
+    return RigidBodyFit.with_needed(pictures, grid, refit(fit, rng))
 
 
 def _small_moved_bodies(pictures: ClipFeatures, grid: MotionGrid) -> list[RigidBody]:
@@ -76,8 +76,14 @@ def _attached(
     return [*found, *track_poses(pictures, found, rng)]
 
 
-def _refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
-    """Every body on the largest connected part of the cells it won; tracked anew where they changed."""
+def refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
+    """Every body on the largest connected part of the cells it won; where these are others, once tracked anew and once
+    as it was, for by other cells it may be lost.
+
+    Args:
+        fit: The bodies, and which cells they won.
+        rng: Chooses the pixels by which a body is tracked.
+    """
     owner, kept, changed = fit.assignment.best_motion, [], []
     for k, body in enumerate(fit.bodies):
         parts = fit.grid.components(owner == k + 1)
@@ -89,4 +95,4 @@ def _refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
             kept.append(replace(body, region=region))
         else:
             changed.append(changed_body(fit.pictures, fit.grid, region, body.motion))
-    return [*kept, *track_poses(fit.pictures, changed, rng)]
+    return [*kept, *track_poses(fit.pictures, changed, rng), *changed]
