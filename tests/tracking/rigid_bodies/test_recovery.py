@@ -71,6 +71,15 @@ def test_its_twin_that_stood_there_from_the_start_is_not_taken_for_it() -> None:
     assert away[BACK].min() > 0.15
 
 
+def test_its_twin_that_comes_where_it_cannot_have_got_to_by_then_is_not_taken_for_it() -> None:
+    gone, came = leaving(OUT_OF_VIEW), np.tile(OUT_OF_VIEW, (FRAMES, 1))
+    place = START + np.array([0.4, 0.1, 0.0])
+    came[GONE.start : GONE.start + 2] = place  # 0.8 m from where it was, at no more than 0.15 m a frame
+    seen = scene([moving_planes.wall(1.2, FRAMES), plate(gone, 1), plate(came, 1)])
+    away = np.linalg.norm(followed(seen).apply(START[None])[:, 0] - place, axis=1)
+    assert away.min() > 0.15
+
+
 class PlainPlate(moving_planes.Plate):
     """A plate of one color."""
 

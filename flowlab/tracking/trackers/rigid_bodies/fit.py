@@ -38,7 +38,7 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
         bodies = refit(RigidBodyFit.with_needed(pictures, grid, bodies), rng)
         if k < _ROUNDS - 1:
             bodies += track_poses(pictures, _bodies_of_unexplained(pictures, grid, bodies), rng)
-            bodies += _attached(pictures, grid, bodies, rng)
+            bodies += _taken_along(pictures, grid, bodies, rng)
     fit = RigidBodyFit.with_needed(pictures, grid, bodies)
     for _ in range(_MERGE_ROUNDS):
         merged = merge(fit, rng)
@@ -68,7 +68,7 @@ def _bodies_of_unexplained(pictures: ClipFeatures, grid: MotionGrid, bodies: lis
     return [new_body(pictures, grid, m) for m in parts]
 
 
-def _attached(
+def _taken_along(
     pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody], rng: np.random.Generator
 ) -> list[RigidBody]:
     """Things that others take along: moving as these do, and aligned to what pictures show of them, too."""

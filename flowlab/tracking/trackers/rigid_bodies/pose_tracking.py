@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int32
 
 from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch, rotate
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
-from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY, NewPlaces, find_again
+from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY, LastSeen, NewPlaces, find_again
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion, fit_rigid
 
 _POINTS_PER_BODY = 400
@@ -54,10 +54,10 @@ def track_poses(
     batch, frames, count = BodyBatch(pictures, [b.pixels for b in bodies], rng, points), len(pictures), len(bodies)
     R, s = np.tile(np.eye(3), (frames, count, 1, 1)), np.zeros((frames, count, 3))
     energy = np.zeros(count)
-    seen_R, seen_s = R[0].copy(), s[0].copy()
+    seen = LastSeen.at_first(count)
     for t in range(1, frames):
         batch.last_center = rotate(R[t - 1], batch.center) + s[t - 1]
-        poses = _easy_guesses(bodies, t, R, s, (seen_R, seen_s))
+        poses = _easy_guesses(bodies, t, R, s, seen)
         if pictures.still is not None:
             poses = _with_stillness(pictures.still, t, R[t - 1], s[t - 1], poses)
         best = _BestPoses(*_choose(batch.energies(t, *poses), *poses))
@@ -67,10 +67,9 @@ def track_poses(
         lightness = pictures.lightness(t)
         best.try_poses(slice(None), *_evaluate(batch, t, *batch.align(t, best.R, best.s, lightness)), slack=1e-3)
         _borrow_motions(batch, t, best, R[t - 1], s[t - 1], lightness)
-        _find_lost(batch, t, best, seen_R, lightness)
+        _find_lost(batch, t, best, seen, lightness)
         R[t], s[t], energy = best.R, best.s, best.energy
-        good = (best.seen > 0.4) & (energy < 0.5)
-        seen_R[good], seen_s[good] = R[t, good], s[t, good]
+        seen.update((best.seen > 0.4) & (energy < 0.5), t, R[t], s[t])
         batch.turn(np.flatnonzero(best.seen > 0.4), R[t], s[t])
     return [replace(b, motion=RigidMotion(R[:, k], s[:, k])) for k, b in enumerate(bodies)]
 
@@ -86,7 +85,7 @@ def _with_stillness(
 
 
 def _easy_guesses(
-    bodies: Sequence[RigidBody], t: int, R: np.ndarray, s: np.ndarray, seen: tuple[np.ndarray, np.ndarray]
+    bodies: Sequence[RigidBody], t: int, R: np.ndarray, s: np.ndarray, seen: LastSeen
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses to try in frame t (B, 4, 3, 3) and (B, 4, 3): that of the frame before, that in which the body was last
     seen well, that to which its last step leads again, and that of its proposal."""
@@ -96,8 +95,8 @@ def _easy_guesses(
     guess_R = np.stack([b.motion.R[t] if b.guessed[t] else R[t - 1, k] for k, b in enumerate(bodies)])
     guess_s = np.stack([b.motion.t[t] if b.guessed[t] else s[t - 1, k] for k, b in enumerate(bodies)])
     return (
-        np.stack([R[t - 1], seen[0], R_step @ R[t - 1], guess_R], 1),
-        np.stack([s[t - 1], seen[1], rotate(R_step, s[t - 1]) + s_step, guess_s], 1),
+        np.stack([R[t - 1], seen.R, R_step @ R[t - 1], guess_R], 1),
+        np.stack([s[t - 1], seen.s, rotate(R_step, s[t - 1]) + s_step, guess_s], 1),
     )
 
 
@@ -199,13 +198,13 @@ def _carried_by_flow(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> tuple[n
     return pictures.unproject(q, z), ok
 
 
-def _find_lost(batch: BodyBatch, t: int, best: _BestPoses, seen_R: np.ndarray, lightness: np.ndarray) -> None:
-    """Look for bodies that are lost all over the picture, turned as they were when they were last seen."""
+def _find_lost(batch: BodyBatch, t: int, best: _BestPoses, seen: LastSeen, lightness: np.ndarray) -> None:
+    """Look for bodies that are lost wherever they may be by now, turned as they were when they were last seen."""
     lost = np.flatnonzero(best.energy > LOST_ENERGY)
     if len(lost):
         new = NewPlaces.of(batch.pictures, t)
         for k in lost:
-            if found := find_again(batch, t, int(k), seen_R[k], lightness, new):
+            if found := find_again(batch, t, int(k), seen, lightness, new):
                 best.R[k], best.s[k], best.energy[k], best.seen[k] = found
 
 

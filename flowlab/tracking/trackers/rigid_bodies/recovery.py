@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from flowlab.tracking.trackers.rigid_bodies import _costs
-from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch
+from flowlab.tracking.trackers.rigid_bodies.body_batch import MAX_STEP_M, BodyBatch
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
+from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 LOST_ENERGY = 0.9
 """A body of a higher energy is not where it is said to be."""
@@ -30,28 +31,27 @@ _FIRST_POINTS, _BEST, _REFINED = 50, 8, 4
 
 
 def find_again(
-    batch: BodyBatch, t: int, k: int, R: Float64[np.ndarray, "3 3"], lightness: Float32[np.ndarray, "h w"],
-    new: "NewPlaces",
-) -> tuple[np.ndarray, np.ndarray, float, float] | None:  # fmt: skip
-    """A pose in which a lost body explains a frame well, wherever in the picture that is.
+    batch: BodyBatch, t: int, k: int, last_seen: "LastSeen", lightness: Float32[np.ndarray, "h w"], new: "NewPlaces"
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """A pose in which a lost body explains a frame well, as far from where it was last seen as it may be by now.
 
     Args:
         batch: Some bodies.
         t: The frame.
         k: Which of them is lost.
-        R: How it was turned when it was last seen.
+        last_seen: How the bodies lay when they were last seen.
         lightness: Of the frame.
         new: Where it may be.
 
     Returns:
         R, s, the energy and the seen share; None where there is no such pose.
     """
-    anchor = _middle(batch, k)
-    places = new.like(batch.pictures, anchor)
-    if len(places) == 0:
+    anchor, R = _middle(batch, k), last_seen.R[k]
+    near = last_seen.within_reach(k, t, anchor, batch.pictures.stillness, new.like(batch.pictures, anchor))
+    if len(near) == 0:
         return None
     every = max(1, batch.points.shape[1] // _FIRST_POINTS)
-    places, _ = _best(batch, t, k, R, places, every, _BEST)
+    places, _ = _best(batch, t, k, R, near, every, _BEST)
     nearby = _NEARBY_PX / batch.pictures.K[0, 0] * places[:, None, 2:]
     places, energy = _best(batch, t, k, R, (places[:, None] + nearby).reshape(-1, 3), every, _REFINED)
     places, of = places[energy < LOST_ENERGY], np.array([k])
@@ -74,6 +74,35 @@ def _best(
     energy = batch.fit(t, np.tile(R, (1, len(places), 1, 1)), shifts[None], np.array([k]), every)[0][0]
     best = np.argsort(energy, kind="stable")[:count]
     return places[best], energy[best]
+
+
+@dataclass(frozen=True, slots=True)
+class LastSeen:
+    """The poses in which B bodies were last seen well, and in which frames that was."""
+
+    R: Float64[np.ndarray, "B 3 3"]
+    s: Float64[np.ndarray, "B 3"]
+    frame: Int64[np.ndarray, "B"]
+
+    @classmethod
+    def at_first(cls, count: int) -> "LastSeen":
+        """In the first frame, as they are there."""
+        return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros(count, int))
+
+    def update(
+        self, which: Bool[np.ndarray, "B"], t: int, R: Float64[np.ndarray, "B 3 3"], s: Float64[np.ndarray, "B 3"]
+    ) -> None:
+        """Frame t shows some of them well, in these poses."""
+        self.R[which], self.s[which], self.frame[which] = R[which], s[which], t
+
+    def within_reach(
+        self, k: int, t: int, middle: Float64[np.ndarray, "3"], still: RigidMotion, places: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "m 3"]:
+        """Those of some places [m] in frame t that the middle [m] of body k may have come to since; ``still`` is how
+        what stands still moves before the camera."""
+        then = self.frame[k]
+        rested = still.R[t] @ still.R[then].T @ (self.R[k] @ middle + self.s[k] - still.t[then]) + still.t[t]
+        return places[np.linalg.norm(places - rested, axis=1) <= MAX_STEP_M * (t - then)]
 
 
 @dataclass(frozen=True, slots=True)
