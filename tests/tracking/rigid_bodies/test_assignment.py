@@ -80,6 +80,7 @@ def test_of_two_motions_of_many_cells_the_right_one_is_needed_though_each_costs_
     #                 still, right, wrong, which is another small thing's own
     rows = [(0.9, 0.30, 0.345)] * 600 + [(0.9, 0.6, 0.4)] * 30
     assert select_needed(volume(*rows)) == [0, 1, 2]
+    assert select_needed(volume(*rows), many_tell_more=False) == [0, 2]
     assert select_needed(volume(*rows[:20], *rows[-30:])) == [0, 2]  # of few cells, so little says nothing
 
 

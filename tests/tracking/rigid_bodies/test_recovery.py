@@ -9,6 +9,7 @@ from rigid_body_scenes import Scene, scene
 from scipy.spatial.transform import Rotation
 
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody, track_poses
+from flowlab.tracking.trackers.rigid_bodies.recovery import LastSeen
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
 FRAMES, GONE, BACK = 18, slice(8, 13), slice(14, 18)
@@ -71,13 +72,21 @@ def test_its_twin_that_stood_there_from_the_start_is_not_taken_for_it() -> None:
     assert away[BACK].min() > 0.15
 
 
-def test_its_twin_that_comes_where_it_cannot_have_got_to_by_then_is_not_taken_for_it() -> None:
-    gone, came = leaving(OUT_OF_VIEW), np.tile(OUT_OF_VIEW, (FRAMES, 1))
-    place = START + np.array([0.4, 0.1, 0.0])
-    came[GONE.start : GONE.start + 2] = place  # 0.8 m from where it was, at no more than 0.15 m a frame
-    seen = scene([moving_planes.wall(1.2, FRAMES), plate(gone, 1), plate(came, 1)])
-    away = np.linalg.norm(followed(seen).apply(START[None])[:, 0] - place, axis=1)
-    assert away.min() > 0.15
+@pytest.mark.parametrize("leap", [0.16, 0.3])
+def test_what_leaps_from_one_picture_to_the_next_is_found(leap: float) -> None:
+    there = START + np.where(np.arange(FRAMES) > 8, leap, 0)[:, None] * np.array([1.0, 0.2, 0])
+    seen = scene([moving_planes.wall(1.2, FRAMES), plate(there, 1)])
+    assert errors(seen, followed(seen)).max() < 0.006
+
+
+def test_a_lost_body_is_looked_for_as_far_away_as_it_may_have_come_before_a_camera_that_moves() -> None:
+    middle, frames = np.array([0.1, 0.0, 4.0]), np.arange(9)
+    still = RigidMotion(np.tile(np.eye(3), (9, 1, 1)), frames[:, None] * np.array([-0.5, 0, 0]))
+    last = LastSeen.at_first(2)
+    last.update(np.array([False, True]), 3, np.tile(np.eye(3), (2, 1, 1)), np.tile([-1.0, 0, 0], (2, 1)))
+    rested = middle - np.array([1.0 + 0.5 * 2, 0, 0])  # the camera went on for two frames
+    far = np.array([[0, 1.19, 0], [1.19, 0, 0], [0, 1.21, 0], [-3.0, 0, 0]])
+    np.testing.assert_allclose(last.within_reach(1, 5, middle, still, rested + far), (rested + far)[:2])
 
 
 class PlainPlate(moving_planes.Plate):

@@ -20,7 +20,8 @@ _REFUTING_FRAMES, _REFUTED = 3, 0.3
 whatever the mean says, and what it costs."""
 _NEEDED = 0.03, 0.10
 """How much more its cells must cost without a motion, in the mean, for it to be kept: the second where there are up to
-a hundred, and less the more there are, as a mean over many errs less, down to the first."""
+a hundred, and less the more there are, as a mean over many errs less, down to the first. Where the camera's motion was
+fitted, too, all cells share its error, and many tell no more."""
 _UNKNOWN_COST = 0.9
 _DOUBTFUL, _DOUBTED_COST, _SPREADS, _PLAIN_SCALE = 0.2, 0.5, 5, 0.08
 """Cells whose best motions differ by less, and of which one explains them, take the cost of their surroundings of the
@@ -136,11 +137,12 @@ def _decide_by_surroundings(raw: np.ndarray, cost: np.ndarray, grid: MotionGrid,
     cost[:, open_to_doubt] = raw[:, open_to_doubt] = settled[:, open_to_doubt]
 
 
-def select_needed(assignment: BodyAssignment) -> list[int]:
+def select_needed(assignment: BodyAssignment, many_tell_more: bool = True) -> list[int]:
     """The motions worth having: dropped, one by one, is what costs its cells little to do without.
 
     Args:
         assignment: What every motion costs.
+        many_tell_more: Whether a motion of many cells is needed though each gains little by it.
 
     Returns:
         Indices of the motions to keep, stillness and at least one more among them, where there is one.
@@ -153,7 +155,7 @@ def select_needed(assignment: BodyAssignment) -> list[int]:
         owner, gain = cost[:, valid].argmin(0), second - best
         cells = np.bincount(owner, minlength=len(kept))[1:].clip(1)
         worth = np.bincount(owner, gain, len(kept))[1:] / cells
-        needed = np.clip(1 / np.sqrt(cells), *_NEEDED)
+        needed = np.clip(1 / np.sqrt(cells), *_NEEDED) if many_tell_more else np.full(len(cells), _NEEDED[1])
         least = int(np.argmin(worth / needed))
         if worth[least] > needed[least]:
             break

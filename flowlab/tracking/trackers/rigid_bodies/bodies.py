@@ -26,7 +26,7 @@ class RigidBodyFit:
     def with_needed(cls, pictures: ClipFeatures, grid: MotionGrid, bodies: Sequence[RigidBody]) -> "RigidBodyFit":
         """The fit by those of some bodies that explain what the others do not."""
         assignment = assign(pictures, grid, [b.motion for b in bodies])
-        kept = select_needed(assignment)
+        kept = select_needed(assignment, many_tell_more=not pictures.still_is_fitted)
         return cls(pictures, grid, tuple(bodies[k - 1] for k in kept[1:]), assignment.select(kept))
 
     @property

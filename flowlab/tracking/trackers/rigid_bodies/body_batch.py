@@ -12,7 +12,7 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import nearest_rotation
 
 _ITERATIONS = 6
 """Of Gauss-Newton, for every frame."""
-MAX_STEP_M, _STEP_PENALTY = 0.15, 10.0
+_MAX_STEP_M, _STEP_PENALTY = 0.15, 10.0
 """Nothing moves farther than this from one frame to the next [m]."""
 _GRAZING = 0.15
 """Cosine of the angle of view below which a surface is not seen well enough to follow."""
@@ -104,7 +104,7 @@ class BodyBatch:
         """Energy and seen share (B', C) of candidate poses (B', C, 3, 3), (B', C, 3) in frame t."""
         energy, seen = self.fit(t, R, s, of, every)
         leap = np.linalg.norm(rotate(R, self.center[of][:, None]) + s - self.last_center[of][:, None], axis=-1)
-        return energy + _STEP_PENALTY * (leap > MAX_STEP_M), seen
+        return energy + _STEP_PENALTY * (leap > _MAX_STEP_M), seen
 
     def align(
         self, t: int, R: np.ndarray, s: np.ndarray, lightness: np.ndarray, of: np.ndarray | slice = slice(None)

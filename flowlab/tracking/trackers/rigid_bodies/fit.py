@@ -35,9 +35,11 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
     proposed = [RigidBody(p.pixels, p.motion, p.known) for p in propose_motions(seeds, _MAX_PROPOSALS, rng)]
     bodies = track_poses(pictures, [*_small_moved_bodies(pictures, grid), *proposed], rng)
     for k in range(_ROUNDS):
-        bodies = refit(RigidBodyFit.with_needed(pictures, grid, bodies), rng)
+        fit = RigidBodyFit.with_needed(pictures, grid, bodies)
+        bodies = refit(fit, rng)
         if k < _ROUNDS - 1:
-            bodies += track_poses(pictures, _bodies_of_unexplained(pictures, grid, bodies), rng)
+            room = max(_MAX_BODIES - len(fit.bodies), 0)
+            bodies += track_poses(pictures, _bodies_of_unexplained(pictures, grid, bodies, room), rng)
             bodies += _taken_along(pictures, grid, bodies, rng)
     fit = RigidBodyFit.with_needed(pictures, grid, bodies)
     for _ in range(_MERGE_ROUNDS):
@@ -59,11 +61,12 @@ def _small_moved_bodies(pictures: ClipFeatures, grid: MotionGrid) -> list[RigidB
     return [new_body(pictures, grid, m) for m in [*parts[:9], *changed]]
 
 
-def _bodies_of_unexplained(pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody]) -> list[RigidBody]:
-    """The largest connected things that moved and that no body explains."""
+def _bodies_of_unexplained(
+    pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody], room: int
+) -> list[RigidBody]:
+    """The largest connected things that moved and that no body explains, as many as there is room for."""
     assignment = assign(pictures, grid, [b.motion for b in bodies])
     unexplained = grid.moved & (assignment.cost.min(0) > _UNEXPLAINED)
-    room = max(_MAX_BODIES - len(bodies), 0)
     parts = [m for m in grid.components(unexplained) if m.sum() >= 7][: min(6, room)]
     return [new_body(pictures, grid, m) for m in parts]
 

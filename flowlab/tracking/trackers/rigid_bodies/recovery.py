@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from flowlab.tracking.trackers.rigid_bodies import _costs
-from flowlab.tracking.trackers.rigid_bodies.body_batch import MAX_STEP_M, BodyBatch
+from flowlab.tracking.trackers.rigid_bodies.body_batch import BodyBatch
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
@@ -18,6 +18,9 @@ _FOUND_ENERGY, _FOUND_SEEN = 0.5, 0.6
 _CLOSER = 2.0
 """A body that is this much farther away or nearer than at first is too small or large in the picture to look as it did;
 of a thing of few pixels, anything far away does."""
+_REACH_M = 0.6
+"""How far away a lost body may have come from one frame to the next [m], of pictures that are seldom taken, too: of the
+color of a far, small thing is much else, meters away."""
 _STEP = 4
 """Every how many pixels, both ways, a place is tried."""
 _LIKE, _AS_BEFORE = 0.6, 0.35
@@ -102,7 +105,7 @@ class LastSeen:
         what stands still moves before the camera."""
         then = self.frame[k]
         rested = still.R[t] @ still.R[then].T @ (self.R[k] @ middle + self.s[k] - still.t[then]) + still.t[t]
-        return places[np.linalg.norm(places - rested, axis=1) <= MAX_STEP_M * (t - then)]
+        return places[np.linalg.norm(places - rested, axis=1) <= _REACH_M * (t - then)]
 
 
 @dataclass(frozen=True, slots=True)
