@@ -116,6 +116,8 @@ def test_a_body_that_won_cells_of_what_stands_still_keeps_its_motion() -> None:
     needed = RigidBodyFit.with_needed(plates.pictures, fit.grid, bodies)
     off = [np.linalg.norm(m.apply(points) - truth, axis=-1).max() for m in needed.motions]
     assert min(off) < 1e-9
+    fitted = replace(fit, pictures=replace(plates.pictures, still_is_fitted=True))
+    assert len(refit(fitted, np.random.default_rng(0))) == 1
 
 
 def test_the_whole_fit_finds_the_plates_and_which_cells_are_theirs() -> None:

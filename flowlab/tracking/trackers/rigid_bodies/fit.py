@@ -81,7 +81,8 @@ def _taken_along(
 
 def refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
     """Every body on the largest connected part of the cells it won; where these are others, once tracked anew and once
-    as it was, for by other cells it may be lost.
+    as it was, for by other cells it may be lost. Where the camera's motion was fitted, too, what motions cost errs too
+    much to tell the two apart, and it is tracked anew only.
 
     Args:
         fit: The bodies, and which cells they won.
@@ -98,4 +99,5 @@ def refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:
             kept.append(replace(body, region=region))
         else:
             changed.append(changed_body(fit.pictures, fit.grid, region, body.motion))
-    return [*kept, *track_poses(fit.pictures, changed, rng), *changed]
+    as_they_were = [] if fit.pictures.still_is_fitted else changed
+    return [*kept, *track_poses(fit.pictures, changed, rng), *as_they_were]
