@@ -157,12 +157,14 @@ def _solve(H, g) -> np.ndarray:
 
 @numba.njit(cache=True, inline="always")
 def _accumulate(H, g, rx, ry, rz, jx, jy, jz, r, w) -> None:
-    """Add one residual, whose derivative by the point's position is (jx, jy, jz), to the normal equations."""
+    """Add one residual, whose derivative by the point's position is (jx, jy, jz), to the normal equations: to what is
+    on and below the diagonal, which Cholesky reads."""
     a = (ry * jz - rz * jy, rz * jx - rx * jz, rx * jy - ry * jx, jx, jy, jz)
     for i in range(6):
-        g[i] += w * a[i] * r
-        for j in range(6):
-            H[i, j] += w * a[i] * a[j]
+        wa = w * a[i]
+        g[i] += wa * r
+        for j in range(i + 1):
+            H[i, j] += wa * a[j]
 
 
 @numba.njit(cache=True)

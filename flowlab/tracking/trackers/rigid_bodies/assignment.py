@@ -1,7 +1,7 @@
 """Which body a pixel belongs to: the one that best explains its depth and color over all frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, Num
@@ -68,7 +68,8 @@ def motion_costs(
     """
     what, shown = _compared(pictures, grid, uv, xyz_cam)
     frames = looked_at(pictures)
-    cost, moved, through = _costs.motion_costs(*what, frames, *_poses(motions), *shown)
+    from_first = np.zeros(len(motions), int)
+    cost, moved, through = _costs.motion_costs(*what, frames, from_first, *_poses(motions), *shown)
     refuted = through * len(frames) >= _REFUTING_FRAMES
     return cost + np.asarray(motion_penalty, np.float32) * moved + np.float32(_REFUTED) * refuted
 
@@ -80,10 +81,13 @@ def frame_costs(
     uv: Num[np.ndarray, "n 2"],
     xyz_cam: Float[np.ndarray, "n 3"],
     frames: Int64[np.ndarray, "F"],
+    since: Int64[np.ndarray, "B"] | None = None,
 ) -> Float32[np.ndarray, "B F"]:
-    """How badly each motion explains points of the first frame in each of some frames, in the mean over the points."""
+    """How badly each motion explains points of the first frame in each of some frames, in the mean over the points; 0
+    up to the frames ``since``, which are not looked at."""
     what, shown = _compared(pictures, grid, uv, xyz_cam)
-    return np.asarray(_costs.frame_costs(*what, frames, *_poses(motions), *shown))
+    since = np.zeros(len(motions), int) if since is None else since
+    return np.asarray(_costs.frame_costs(*what, frames, since, *_poses(motions), *shown))
 
 
 def looked_at(pictures: ClipFeatures) -> Int64[np.ndarray, "F"]:
@@ -105,14 +109,31 @@ def _compared(
     return (xyz_cam, features), (still.R, still.t, static, pictures.depth, pictures.feature, pictures.K)
 
 
-def assign(pictures: ClipFeatures, grid: MotionGrid, motions: Sequence[RigidMotion]) -> BodyAssignment:
+@dataclass(frozen=True, slots=True)
+class CellCosts:
+    """What motions cost the cells of a clip's first frame whose motion is undecided; each is computed once."""
+
+    pictures: ClipFeatures
+    grid: MotionGrid
+    _known: dict[int, tuple[RigidMotion, Float32[np.ndarray, "n"]]] = field(default_factory=dict)
+    """By the identity of the motion."""
+
+    def of(self, motions: Sequence[RigidMotion]) -> Float32[np.ndarray, "B n"]:
+        """The cost of each motion, see :func:`motion_costs`."""
+        if new := [m for m in motions if id(m) not in self._known]:
+            uv = self.grid.pixels(self.grid.undecided)
+            xyz = self.pictures.unproject(uv.astype(float), self.grid.depth[self.grid.undecided].astype(float))
+            cost = motion_costs(self.pictures, self.grid, new, uv, xyz)
+            self._known.update({id(m): (m, c) for m, c in zip(new, cost, strict=True)})
+        return np.stack([self._known[id(m)][1] for m in motions])
+
+
+def assign(cells: CellCosts, motions: Sequence[RigidMotion]) -> BodyAssignment:
     """Costs of stillness and of some motions, in all cells whose motion is undecided."""
-    every = [pictures.stillness, *motions]
+    pictures, grid, every = cells.pictures, cells.grid, [cells.pictures.stillness, *motions]
     raw = np.full((len(every), *grid.valid.shape), _UNKNOWN_COST, np.float32)
     raw[0] = 0
-    uv = grid.pixels(grid.undecided)
-    xyz = pictures.unproject(uv.astype(float), grid.depth[grid.undecided].astype(float))
-    raw[:, grid.undecided] = motion_costs(pictures, grid, every, uv, xyz)
+    raw[:, grid.undecided] = cells.of(every)
     feature = pictures.feature[0, ::STEP, ::STEP]
     cost = _surfaces.aggregate(
         raw, grid.undecided, grid.valid, grid.depth, feature, _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE

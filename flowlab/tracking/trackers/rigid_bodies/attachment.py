@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Num
+from jaxtyping import Bool, Float32, Float64, Int64, Num
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, frame_costs, looked_at, motion_costs
 from flowlab.tracking.trackers.rigid_bodies.bodies import changed_body
@@ -51,10 +51,11 @@ def attached_bodies(
 def attach(before: RigidMotion, after: RigidMotion, frame: int) -> RigidMotion:
     """The motion ``before`` up to a frame, and from then on as a thing moves that is attached to one that moves as
     ``after`` says."""
-    R = after.R @ (after.R[frame].T @ before.R[frame])
-    t = (after.R @ (after.R[frame].T @ (before.t[frame] - after.t[frame]))) + after.t
-    later = np.arange(len(R)) > frame
-    return RigidMotion(np.where(later[:, None, None], R, before.R), np.where(later[:, None], t, before.t))
+    R, t, later = before.R.copy(), before.t.copy(), slice(frame + 1, None)
+    back = after.R[frame].T
+    R[later] = after.R[later] @ (back @ before.R[frame])
+    t[later] = after.R[later] @ (back @ (before.t[frame] - after.t[frame])) + after.t[later]
+    return RigidMotion(R, t)
 
 
 def _regions(grid: MotionGrid, assignment: BodyAssignment) -> list[tuple[int, Bool[np.ndarray, "h w"]]]:
@@ -88,10 +89,15 @@ class _Region:
         """What each motion costs in the mean."""
         return np.asarray(motion_costs(self.pictures, self.grid, motions, self.uv, self.xyz_cam).mean(1))
 
-    def unfinished_costs(self, motions: Sequence[RigidMotion]) -> Float64[np.ndarray, "B"]:
-        """What each motion costs in the mean, if from its best moment on another might explain the region badly."""
-        frames = looked_at(self.pictures)
-        cost = frame_costs(self.pictures, self.grid, motions, self.uv, self.xyz_cam, frames)
+    def unfinished_costs(
+        self, first: RigidMotion, motions: Sequence[RigidMotion], since: Int64[np.ndarray, "B"]
+    ) -> Float64[np.ndarray, "B"]:
+        """What each motion costs in the mean, if from its best moment on another might explain the region badly. Up to
+        the frames ``since`` they all are as one is that comes ``first``."""
+        frames, of = looked_at(self.pictures), (self.uv, self.xyz_cam)
+        cost = frame_costs(self.pictures, self.grid, motions, *of, frames, since)
+        begin = frame_costs(self.pictures, self.grid, [first], *of, frames)
+        cost = np.where(frames <= since[:, None], begin, cost)
         return np.asarray((np.cumsum(cost - _OPEN, 1).min(1) / len(frames)).astype(float))
 
     def moments(self, motion: RigidMotion) -> list[int]:
@@ -108,11 +114,16 @@ def _attached(region: _Region, motions: Sequence[RigidMotion], owner: int) -> Ri
     attached to another, and perhaps rest in the end; None where that is no better than the motions themselves."""
     alone = region.costs(motions)
     begin = [motions[k] for k in dict.fromkeys((0, owner, int(alone.argmin())))]
-    moments = [(first, region.moments(first)) for first in begin]
-    taken = [attach(first, then, t) for first, at in moments for then in motions for t in at]
-    taken = [taken[k] for k in np.argsort(region.unfinished_costs(taken), kind="stable")[:_TAKEN]]
+    taken, cost = list[RigidMotion](), list[Float64[np.ndarray, "n"]]()
+    for first in begin:
+        moments = region.moments(first)
+        after = [(then, t) for then in motions for t in moments]
+        held = [attach(first, then, t) for then, t in after]
+        cost.append(region.unfinished_costs(first, held, np.array([t for _, t in after])))
+        taken += held
+    taken = [taken[k] for k in np.argsort(np.concatenate(cost), kind="stable")[:_TAKEN]]
     put_down = [attach(held, motions[0], t) for held in taken for t in region.moments(held)]
     found = taken + put_down
-    cost = region.costs(found) + np.where(np.arange(len(found)) < len(taken), 0, _PUT_DOWN_GAIN)
-    best = int(cost.argmin())
-    return found[best] if cost[best] <= alone.min() - _GAIN else None
+    total = region.costs(found) + np.where(np.arange(len(found)) < len(taken), 0, _PUT_DOWN_GAIN)
+    best = int(total.argmin())
+    return found[best] if total[best] <= alone.min() - _GAIN else None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Integer
 
-from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, assign, select_needed
+from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, CellCosts, assign, select_needed
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, MotionGrid
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
@@ -17,17 +17,26 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 class RigidBodyFit:
     """What explains a clip; motion k of the assignment is body k - 1, and 0 is stillness."""
 
-    pictures: ClipFeatures
-    grid: MotionGrid
+    cells: CellCosts
     bodies: tuple[RigidBody, ...]
     assignment: BodyAssignment
 
     @classmethod
-    def with_needed(cls, pictures: ClipFeatures, grid: MotionGrid, bodies: Sequence[RigidBody]) -> "RigidBodyFit":
+    def with_needed(cls, cells: CellCosts, bodies: Sequence[RigidBody]) -> "RigidBodyFit":
         """The fit by those of some bodies that explain what the others do not."""
-        assignment = assign(pictures, grid, [b.motion for b in bodies])
-        kept = select_needed(assignment, many_tell_more=not pictures.still_is_fitted)
-        return cls(pictures, grid, tuple(bodies[k - 1] for k in kept[1:]), assignment.select(kept))
+        assignment = assign(cells, [b.motion for b in bodies])
+        kept = select_needed(assignment, many_tell_more=not cells.pictures.still_is_fitted)
+        return cls(cells, tuple(bodies[k - 1] for k in kept[1:]), assignment.select(kept))
+
+    @property
+    def pictures(self) -> ClipFeatures:
+        """The clip."""
+        return self.cells.pictures
+
+    @property
+    def grid(self) -> MotionGrid:
+        """The cells of its first frame."""
+        return self.cells.grid
 
     @property
     def motions(self) -> list[RigidMotion]:

@@ -41,9 +41,7 @@ class Surface:
 
     def facing(self, R: Float64[np.ndarray, "3 3"], s: Float64[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
         """Which points a pose turns to the camera; one whose normal is not known counts as if it did."""
-        x = self.points @ R.T + s
-        toward = -((self.normals @ R.T) * x).sum(1)
-        return (toward > _GRAZING * np.linalg.norm(x, axis=1)) | (self.normals == 0).all(1)
+        return _costs.facing(self.points, self.normals, R, s, _GRAZING)
 
 
 class BodyBatch:
@@ -82,29 +80,35 @@ class BodyBatch:
         """
         for k in of:
             surface, used = self._surfaces[k], self._used[k]
-            facing = np.flatnonzero(surface.facing(R[k], s[k]))
-            enough = np.isin(used, facing).mean() >= _FACING_SHARE and len(facing) <= _MORE_FACING * self._facing[k]
-            if enough or len(facing) < _LEAST_FACING:
+            facing = surface.facing(R[k], s[k])
+            count = int(facing.sum())
+            enough = facing[used].mean() >= _FACING_SHARE and count <= _MORE_FACING * self._facing[k]
+            if enough or count < _LEAST_FACING:
                 continue
-            used = _sample(facing, len(used), self._rng)
-            self._used[k], self._facing[k] = used, len(facing)
+            used = _sample(np.flatnonzero(facing), len(used), self._rng)
+            self._used[k], self._facing[k] = used, count
             self.points[k], self.features[k] = surface.points[used], surface.features[used]
             self.lightness[k] = self.features[k, :, 1]
 
     def fit(
         self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What :meth:`energies` gives, however far the poses are from where the bodies were."""
-        p = self.pictures
-        return _costs.energies(self.points[of], self.features[of], R, s, p.depth[t], p.feature[t], p.K, every)
+        """Energy and seen share of each of some poses, however far they are from where the bodies were."""
+        return self._evaluate(t, R, s, of, every, np.zeros(R.shape[:2]), False)
+
+    def _evaluate(
+        self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice, every: int, base: np.ndarray, best: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        p, what = self.pictures, (self.points[of], self.features[of])
+        return _costs.energies(*what, R, s, p.depth[t], p.feature[t], p.K, every, base, best)
 
     def energies(
         self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Energy and seen share (B', C) of candidate poses (B', C, 3, 3), (B', C, 3) in frame t."""
-        energy, seen = self.fit(t, R, s, of, every)
+        """Energy and seen share (B', C) of candidate poses (B', C, 3, 3), (B', C, 3) in frame t; of a pose that is
+        worse than one before it, a bound of the energy that is worse, too."""
         leap = np.linalg.norm(rotate(R, self.center[of][:, None]) + s - self.last_center[of][:, None], axis=-1)
-        return energy + _STEP_PENALTY * (leap > _MAX_STEP_M), seen
+        return self._evaluate(t, R, s, of, every, _STEP_PENALTY * (leap > _MAX_STEP_M), True)
 
     def align(
         self, t: int, R: np.ndarray, s: np.ndarray, lightness: np.ndarray, of: np.ndarray | slice = slice(None)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowlab.tracking.trackers.rigid_bodies.assignment import assign
+from flowlab.tracking.trackers.rigid_bodies.assignment import CellCosts, assign
 from flowlab.tracking.trackers.rigid_bodies.attachment import attached_bodies
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, changed_body, new_body
 from flowlab.tracking.trackers.rigid_bodies.camera_motion import with_camera_motion
@@ -34,20 +34,21 @@ def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
     seeds = track_seeds(pictures, grid.pixels(grid.valid & ~grid.static & ~grid.edge), rng)
     proposed = [RigidBody(p.pixels, p.motion, p.known) for p in propose_motions(seeds, _MAX_PROPOSALS, rng)]
     bodies = track_poses(pictures, [*_small_moved_bodies(pictures, grid), *proposed], rng)
+    cells = CellCosts(pictures, grid)
     for k in range(_ROUNDS):
-        fit = RigidBodyFit.with_needed(pictures, grid, bodies)
+        fit = RigidBodyFit.with_needed(cells, bodies)
         bodies = refit(fit, rng)
         if k < _ROUNDS - 1:
             room = max(_MAX_BODIES - len(fit.bodies), 0)
-            bodies += track_poses(pictures, _bodies_of_unexplained(pictures, grid, bodies, room), rng)
-            bodies += _taken_along(pictures, grid, bodies, rng)
-    fit = RigidBodyFit.with_needed(pictures, grid, bodies)
+            bodies += track_poses(pictures, _bodies_of_unexplained(cells, bodies, room), rng)
+            bodies += _taken_along(cells, bodies, rng)
+    fit = RigidBodyFit.with_needed(cells, bodies)
     for _ in range(_MERGE_ROUNDS):
         merged = merge(fit, rng)
         if merged is None:
             break
         fit = merged
-    return RigidBodyFit.with_needed(pictures, grid, refit(fit, rng))
+    return RigidBodyFit.with_needed(cells, refit(fit, rng))
 
 
 def _small_moved_bodies(pictures: ClipFeatures, grid: MotionGrid) -> list[RigidBody]:
@@ -61,22 +62,18 @@ def _small_moved_bodies(pictures: ClipFeatures, grid: MotionGrid) -> list[RigidB
     return [new_body(pictures, grid, m) for m in [*parts[:9], *changed]]
 
 
-def _bodies_of_unexplained(
-    pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody], room: int
-) -> list[RigidBody]:
+def _bodies_of_unexplained(cells: CellCosts, bodies: list[RigidBody], room: int) -> list[RigidBody]:
     """The largest connected things that moved and that no body explains, as many as there is room for."""
-    assignment = assign(pictures, grid, [b.motion for b in bodies])
-    unexplained = grid.moved & (assignment.cost.min(0) > _UNEXPLAINED)
-    parts = [m for m in grid.components(unexplained) if m.sum() >= 7][: min(6, room)]
-    return [new_body(pictures, grid, m) for m in parts]
+    assignment = assign(cells, [b.motion for b in bodies])
+    unexplained = cells.grid.moved & (assignment.cost.min(0) > _UNEXPLAINED)
+    parts = [m for m in cells.grid.components(unexplained) if m.sum() >= 7][: min(6, room)]
+    return [new_body(cells.pictures, cells.grid, m) for m in parts]
 
 
-def _taken_along(
-    pictures: ClipFeatures, grid: MotionGrid, bodies: list[RigidBody], rng: np.random.Generator
-) -> list[RigidBody]:
+def _taken_along(cells: CellCosts, bodies: list[RigidBody], rng: np.random.Generator) -> list[RigidBody]:
     """Things that others take along: moving as these do, and aligned to what pictures show of them, too."""
-    found = attached_bodies(pictures, grid, bodies, assign(pictures, grid, [b.motion for b in bodies]))
-    return [*found, *track_poses(pictures, found, rng)]
+    found = attached_bodies(cells.pictures, cells.grid, bodies, assign(cells, [b.motion for b in bodies]))
+    return [*found, *track_poses(cells.pictures, found, rng)]
 
 
 def refit(fit: RigidBodyFit, rng: np.random.Generator) -> list[RigidBody]:

@@ -44,7 +44,7 @@ def merge(fit: RigidBodyFit, rng: np.random.Generator) -> RigidBodyFit | None:
     if not accepted:
         return None
     bodies = [*(b for k, b in enumerate(fit.bodies) if k + 1 not in done), *accepted]
-    return RigidBodyFit.with_needed(fit.pictures, fit.grid, bodies)
+    return RigidBodyFit.with_needed(fit.cells, bodies)
 
 
 def neighbors(fit: RigidBodyFit) -> list[tuple[int, int]]:

@@ -18,8 +18,8 @@ _HIGH_ENERGY, _ENERGY_RISE = 0.4, 0.05
 _LOST, _GOOD = 0.4, 0.6
 """Energies above which a body is lost, and below which another may hold it."""
 _SHIFTS = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.0)
-_FAN_PX = np.array([(x, y, 0.0) for y in _SHIFTS for x in _SHIFTS])
-"""Shifts in the picture [px] that a wider search tries."""
+_FAN_PX = np.array(sorted(((x, y, 0.0) for y in _SHIFTS for x in _SHIFTS), key=np.linalg.norm))
+"""Shifts in the picture [px] that a wider search tries, the least first: it is often the best, which spares the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,42 +160,32 @@ def _by_flow(
     batch: BodyBatch, t: int, best: _BestPoses, hard: np.ndarray, last_R: np.ndarray, last_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The poses that optical flow of the points seen in the last frame asks for; the best where it asks for none."""
-    R, s = best.R[hard].copy(), best.s[hard].copy()
-    xyz = batch.points[hard] @ last_R[hard].swapaxes(1, 2) + last_s[hard][:, None]
-    which, point = np.nonzero(_seen_every_third(batch.pictures, t - 1, xyz))
-    if len(which) == 0:
-        return R, s
-    target, ok = _carried_by_flow(batch.pictures, t, xyz[which, point])
-    for k in range(len(hard)):
-        mine = ok & (which == k)
-        if mine.sum() >= 6:
-            weight = np.ones(int(mine.sum()))
-            R[k], s[k] = fit_rigid(batch.points[hard[k], point[mine]], target[mine], weight, 3, scale=0.004)
+    points = batch.points[hard, ::3]
+    xyz = points @ last_R[hard].swapaxes(1, 2) + last_s[hard][:, None]
+    target, ok = _carried_by_flow(batch.pictures, t, xyz)
+    R, s = fit_rigid(points, target, ok, 3, scale=0.004)
+    few = ok.sum(1) < 6
+    R[few], s[few] = best.R[hard[few]], best.s[hard[few]]
     return R, s
 
 
-def _seen_every_third(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> np.ndarray:
-    """Which of the points (B, n, 3) [m] frame t shows, among every third of each body."""
-    height, width = pictures.depth.shape[1:]
-    uv = pictures.project(xyz)
-    j, i = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int).transpose(2, 0, 1)
-    there = (uv >= 0).all(-1) & (uv[..., 0] <= width - 1) & (uv[..., 1] <= height - 1)
-    there &= np.abs(pictures.depth[t, i, j] - xyz[..., 2]) < 0.02
-    there[:, np.arange(there.shape[1]) % 3 > 0] = False
-    return there
-
-
 def _carried_by_flow(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where optical flow takes points (n, 3) [m] of frame t - 1 that it shows, and where that can be believed."""
-    height, width = pictures.depth.shape[1:]
+    """Where optical flow takes points (B, n, 3) [m] of frame t - 1, and where that shows them and it can be believed."""
     uv = pictures.project(xyz)
-    j, i = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int).T
+    j, i, ok = _pixels(pictures, uv)
+    ok &= np.abs(pictures.depth[t - 1, i, j] - xyz[..., 2]) < 0.02
     q = uv + pictures.flow[t, i, j]
-    ok = (q >= 0).all(1) & (q[:, 0] <= width - 1) & (q[:, 1] <= height - 1)
-    j, i = np.clip(np.rint(q), 0, [width - 1, height - 1]).astype(int).T
+    j, i, inside = _pixels(pictures, q)
     z = pictures.depth[t, i, j].astype(float)
-    ok &= (z > 0) & (np.abs(z - xyz[:, 2]) < 0.03)
+    ok &= inside & (z > 0) & (np.abs(z - xyz[..., 2]) < 0.03)
     return pictures.unproject(q, z), ok
+
+
+def _pixels(pictures: ClipFeatures, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows of the pixels nearest to some places (..., 2), and which of these are in the picture."""
+    last = np.array(pictures.depth.shape[:0:-1]) - 1
+    j, i = np.moveaxis(np.rint(np.minimum(np.maximum(uv, 0), last)).astype(int), -1, 0)
+    return j, i, (uv >= 0).all(-1) & (uv <= last).all(-1)
 
 
 def _find_lost(batch: BodyBatch, t: int, best: _BestPoses, seen: LastSeen, lightness: np.ndarray) -> None:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
+from flowlab.tracking.trackers.rigid_bodies import _kabsch
+
 
 @dataclass(frozen=True, slots=True)
 class RigidMotion:
@@ -34,7 +36,7 @@ def fit_rigid(
     refinements: int,
     scale: float = 0.006,
 ) -> tuple[Float64[np.ndarray, "*out 3 3"], Float64[np.ndarray, "*out 3"]]:
-    """The rigid motions that best take points onto others (Kabsch 1976, reweighted by Geman-McClure).
+    """The rigid motions that best take points onto others (Horn 1987, reweighted by Geman-McClure).
 
     Args:
         a: Points [m]; leading dimensions broadcast.
@@ -47,20 +49,12 @@ def fit_rigid(
         R and t, so that ``b`` is near ``R @ a + t``. R is a rotation, never a reflection, also where points on a
         line or in a plane leave one open.
     """
-    w = weight.astype(float)
-    for k in range(refinements + 1):
-        share = (w / np.maximum(w.sum(-1, keepdims=True), 1e-12))[..., None]
-        center_a, center_b = (share * a).sum(-2), (share * b).sum(-2)
-        H = np.swapaxes(share * (a - center_a[..., None, :]), -1, -2) @ (b - center_b[..., None, :])
-        U, _, Vt = np.linalg.svd(H + 1e-12 * np.eye(3))
-        flip = np.ones((*U.shape[:-2], 3))
-        flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
-        R = np.swapaxes(U * flip[..., None, :] @ Vt, -1, -2)
-        t = center_b - (R @ center_a[..., None])[..., 0]
-        if k < refinements:
-            off = np.linalg.norm(a @ np.swapaxes(R, -1, -2) + t[..., None, :] - b, axis=-1)
-            w = weight / (1 + (off / scale) ** 2) ** 2
-    return R, t
+    batch = np.broadcast_shapes(a.shape[:-2], b.shape[:-2], weight.shape[:-1])
+    n = weight.shape[-1]
+    points = (np.broadcast_to(x, (*batch, n, 3)).reshape(-1, n, 3).astype(float) for x in (a, b))
+    flat = np.broadcast_to(weight, (*batch, n)).reshape(-1, n).astype(float)
+    R, t = _kabsch.fit_rigid(*points, flat, refinements, scale)
+    return R.reshape(*batch, 3, 3), t.reshape(*batch, 3)
 
 
 def nearest_rotation(R: Float64[np.ndarray, "*batch 3 3"]) -> Float64[np.ndarray, "*batch 3 3"]:

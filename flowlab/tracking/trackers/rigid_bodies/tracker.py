@@ -31,7 +31,7 @@ class RigidBodies(Tracker):
 
     A point that no motion explains, or that has no depth where it is asked for, is followed by
     :class:`~flowlab.tracking.trackers.lucas_kanade.LucasKanade` in chunks instead. Source: the method is flowlab's own;
-    its parts are Kabsch (1976), RANSAC over trajectories, point-to-plane and photometric Gauss-Newton.
+    its parts are Horn (1987), RANSAC over trajectories, point-to-plane and photometric Gauss-Newton.
     """
 
     name: ClassVar[str] = "rigid-bodies"
