@@ -35,7 +35,7 @@ from flowlab.tracking.chunking import ChunkSettings, follow
 from flowlab.tracking.error_model import FAR_M, Doubt, ErrorModel, log_scale
 from flowlab.tracking.lifting import LiftSettings, lift
 from flowlab.tracking.trackers.rigid_bodies import doubt
-from flowlab.tracking.trackers.rigid_bodies.tracker import RigidBodies, combined, fit_points
+from flowlab.tracking.trackers.rigid_bodies.tracker import COMPANION, RigidBodies, combined, fit_points
 
 TASKS = (
     "button-press", "coffee-push", "dial-turn", "handle-press", "lever-pull", "peg-insert-side", "plate-slide",
@@ -148,13 +148,15 @@ def _collect(recording: Path, family: str, carried: bool) -> list[Sample]:
         print(f"    left out: {error}")
         return []
     options = RigidBodies()
-    followed = follow(clip, truth.query_px, make_tracker("lucas-kanade"), ChunkSettings())
-    fitted = fit_points(clip, truth.query_px, followed, options)
+    followed, companion = (
+        follow(clip, truth.query_px, make_tracker("lucas-kanade"), chunks) for chunks in (ChunkSettings(), COMPANION)
+    )
+    fitted = fit_points(clip, truth.query_px, companion, options)
     against = np.zeros((*truth.visible.shape, len(doubt.EVIDENCE)))
     if fitted is not None:
         against[:, fitted.points] = fitted.evidence
     samples = []
-    for tracks in (followed, combined(clip, followed, fitted, options.unexplained)):
+    for tracks in (followed, combined(clip, companion, fitted, options.unexplained)):
         lifted = lift(clip, tracks, LiftSettings())
         xyz_cam = clip.to_camera(lifted.xyz_world.astype(np.float64))
         error_m = np.linalg.norm(xyz_cam - truth.tracks_cam, axis=-1)

@@ -17,7 +17,7 @@ from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 EVIDENCE = {
     "surroundings": 1, "worst surroundings": 1, "misfit": 1, "worst misfit": 1, "other motions around": 1, "spread": 1,
     "apart": 1, "slippage": 1, "fastest": 1, "moved": 0, "camera moved": 0, "hidden for": 0, "still": 0,
-    "cells": 0, "share of cells": 0, "out of view": 0,
+    "cells": 0, "share of cells": 0, "out of view": 0, "turned": 0, "cost": 1, "gain": 0,
 }  # fmt: skip
 """What doubt is told from, see :func:`evidence`, and whether more of it (1) never states less."""
 _OF_SLIPPAGE = 0.5
@@ -89,7 +89,9 @@ def evidence(
         almost as well, and how far the other tracker, would put it; its slippage; the longest step of its body so far
         and how far it has moved [m], before what stands still; how far that has moved itself where it was found in the
         pictures; for how many frames it has been hidden; whether it is said to stand still; how many
-        cells are its body's, also as a share of all; and the share of its surroundings that is out of the picture.
+        cells are its body's, also as a share of all; the share of its surroundings that is out of the picture; by how
+        much its body has turned [rad]; how badly its motion explains it over all; and how much worse the cells of its
+        body would be explained without it.
     """
     still, xyz_cam = fit.motions[0], fit.pictures.unproject(uv.astype(float), z.astype(float))
     moved = np.linalg.norm(_undo(still, carried.xyz_cam) - xyz_cam, axis=-1)
@@ -115,6 +117,9 @@ def evidence(
         count[carried.motion],
         count[carried.motion] / max(count.sum(), 1),
         cells.out_of_view[:, around].mean(-1),
+        _turned(fit)[:, carried.motion],
+        carried.cost,
+        _gain(fit)[carried.motion],
     )
     return np.stack([np.broadcast_to(c, seen.shape) for c in columns], -1).astype(np.float64)
 
@@ -145,6 +150,24 @@ def _fastest(fit: RigidBodyFit) -> Float64[np.ndarray, "T B"]:
             path = _undo(fit.motions[0], motion.apply(middle))[:, 0]
             steps[1:, k] = np.linalg.norm(np.diff(path, axis=0), axis=1)
     return np.maximum.accumulate(steps)
+
+
+def _turned(fit: RigidBodyFit) -> Float64[np.ndarray, "T B"]:
+    """The angle [rad] by which each body is turned, before what stands still."""
+    turns = [m.R @ fit.motions[0].R.swapaxes(1, 2) for m in fit.motions]
+    return np.stack([np.arccos(((np.trace(R, axis1=1, axis2=2) - 1) / 2).clip(-1, 1)) for R in turns], 1)
+
+
+def _gain(fit: RigidBodyFit) -> Float64[np.ndarray, "B"]:
+    """How much more the cells of each motion would cost with the next best one, in the mean; 0 if there is none."""
+    owner, cost = fit.assignment.best_motion, fit.assignment.cost
+    gain = np.zeros(len(cost))
+    for k in range(len(cost)):
+        cells = owner == k
+        if len(cost) > 1 and cells.any():
+            best, second = np.partition(cost[:, cells], 1, axis=0)[:2]
+            gain[k] = (second - best).mean()
+    return gain
 
 
 def _frames_hidden(seen: Bool[np.ndarray, "T M"]) -> Float64[np.ndarray, "T M"]:
