@@ -8,7 +8,7 @@ import numpy as np
 
 from flowlab.geometry.sampling import farthest_points
 from flowlab.records import Clip
-from flowlab.tracking.trackers.rigid_bodies.assignment import assign
+from flowlab.tracking.trackers.rigid_bodies.assignment import CellCosts, assign
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures, extract_features
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import STEP, segment_motion
@@ -91,8 +91,8 @@ def scene(plates: list[moving_planes.Plate], noise: float = 0.0) -> Scene:
 
 def fit_of(seen: Scene, *motions: RigidMotion) -> RigidBodyFit:
     """Motions that are known, as a fit of a scene."""
-    grid = segment_motion(seen.pictures)
+    cells = CellCosts(seen.pictures, segment_motion(seen.pictures))
     frames = len(seen.pictures)
     nowhere = np.zeros((0, 2), np.int32)
     bodies = tuple(RigidBody(nowhere, m, np.zeros(frames, bool)) for m in motions)
-    return RigidBodyFit(seen.pictures, grid, bodies, assign(seen.pictures, grid, motions))
+    return RigidBodyFit(cells, bodies, assign(cells, motions))

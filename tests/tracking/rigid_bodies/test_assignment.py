@@ -9,14 +9,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rigid_body_scenes import scene, two_plates
 
-from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, assign, motion_costs, select_needed
+from flowlab.tracking.trackers.rigid_bodies.assignment import (
+    BodyAssignment,
+    CellCosts,
+    assign,
+    motion_costs,
+    select_needed,
+)
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
 
 
 def test_cells_belong_to_the_plate_they_show() -> None:
     scene = two_plates()
     grid = segment_motion(scene.pictures)
-    assignment = assign(scene.pictures, grid, [scene.motion(1), scene.motion(2)])
+    assignment = assign(CellCosts(scene.pictures, grid), [scene.motion(1), scene.motion(2)])
     assert assignment.raw.shape == assignment.cost.shape == (3, *grid.valid.shape)
     best, owner = assignment.best_motion, scene.owner_of_cell
     assert (best[grid.valid] == owner[grid.valid]).mean() > 0.95
@@ -32,8 +38,19 @@ def test_cells_without_depth_belong_to_nobody() -> None:
     holes[5:9, 5:9] = False
     grid = type(grid)(grid.v, grid.u, np.where(holes, grid.depth, 0), holes, grid.edge, grid.moved & holes,
                       grid.static & holes, grid.undecided & holes, grid.changed & holes)  # fmt: skip
-    assignment = assign(scene.pictures, grid, [scene.motion(1)])
+    assignment = assign(CellCosts(scene.pictures, grid), [scene.motion(1)])
     np.testing.assert_array_equal(assignment.best_motion == -1, ~holes)
+
+
+def test_what_a_motion_costs_cells_is_computed_once_whatever_comes_beside_it() -> None:
+    scene = two_plates()
+    grid, (one, other) = segment_motion(scene.pictures), (scene.motion(k) for k in (1, 2))
+    cells, uv = CellCosts(scene.pictures, grid), grid.pixels(grid.undecided)
+    first = cells.of([one])
+    both = cells.of([other, one])
+    expected = motion_costs(scene.pictures, grid, [other, one], uv, scene.points(uv))
+    np.testing.assert_allclose(both, expected, atol=1e-6)
+    np.testing.assert_array_equal(both[1], first[0])
 
 
 def test_stillness_is_preferred_where_motions_explain_alike() -> None:

@@ -11,7 +11,7 @@ from rigid_body_scenes import Scene, scene
 from scipy.spatial.transform import Rotation
 from thoroughness import examples
 
-from flowlab.tracking.trackers.rigid_bodies.assignment import assign
+from flowlab.tracking.trackers.rigid_bodies.assignment import CellCosts, assign
 from flowlab.tracking.trackers.rigid_bodies.attachment import attach, attached_bodies
 from flowlab.tracking.trackers.rigid_bodies.bodies import new_body
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
@@ -52,7 +52,9 @@ def attached_thing(seen: Scene) -> RigidMotion | None:
     hand = RigidBody(seen.pixels(2), seen.motion(2), np.ones(FRAMES, bool))
     thing = new_body(seen.pictures, grid, grid.valid & (seen.owner_of_cell == 1))
     bodies = [hand, thing]
-    found = attached_bodies(seen.pictures, grid, bodies, assign(seen.pictures, grid, [b.motion for b in bodies]))
+    found = attached_bodies(
+        seen.pictures, grid, bodies, assign(CellCosts(seen.pictures, grid), [b.motion for b in bodies])
+    )
     cells = seen.owner_of_cell == 1
     of_it = [b for b in found if b.region is not None and cells[b.region].mean() > 0.9]
     return of_it[0].motion if of_it else None

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
+from thoroughness import examples
 
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.assignment import frame_costs, looked_at, motion_costs
@@ -61,7 +63,7 @@ def test_a_point_that_goes_through_shadow_is_not_taken_for_hidden_but_nothing_el
     assert np.median(cost) < 0.6  # what it costs to be hidden
     features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
     pose = motion.R[None, None, t], motion.t[None, None, t]
-    seen = pictures.depth[t], pictures.feature[t], pictures.K, 1
+    seen = pictures.depth[t], pictures.feature[t], pictures.K, 1, np.zeros((1, 1)), False
     assert _costs.energies(scene.points(uv)[None], features[None], *pose, *seen)[0] > LOST_ENERGY
     path = motion.apply(scene.points(uv))
     residual = _costs.residuals(pictures.depth, pictures.feature, features, pictures.project(path), path[..., 2])
@@ -113,7 +115,8 @@ def test_energy_is_least_where_the_body_is_and_tells_free_space_from_what_hides(
     p = scene.pictures
 
     def energies(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        energy, seen = _costs.energies(xyz[None], features[None], R[None], s[None], p.depth[t], p.feature[t], p.K, 1)
+        shown = p.depth[t], p.feature[t], p.K, 1, np.zeros((1, len(R))), False
+        energy, seen = _costs.energies(xyz[None], features[None], R[None], s[None], *shown)
         return energy[0], seen[0]
 
     energy, seen = energies(points)
@@ -132,10 +135,70 @@ def test_every_nth_point_may_be_looked_at() -> None:
     uv = scene.some_pixels(1, 300)
     points, p = scene.points(uv), scene.pictures
     features = _costs.features_at(p.feature[0], uv.astype(np.float32))
-    R, s = np.eye(3)[None, None], np.zeros((1, 1, 3))
-    thinned = _costs.energies(points[None], features[None], R, s, p.depth[t], p.feature[t], p.K, 3)
-    chosen = _costs.energies(points[None, ::3], features[None, ::3], R, s, p.depth[t], p.feature[t], p.K, 1)
+    R, s, shown = np.eye(3)[None, None], np.zeros((1, 1, 3)), (p.depth[t], p.feature[t], p.K)
+    thinned = _costs.energies(points[None], features[None], R, s, *shown, 3, np.zeros((1, 1)), False)
+    chosen = _costs.energies(points[None, ::3], features[None, ::3], R, s, *shown, 1, np.zeros((1, 1)), False)
     np.testing.assert_allclose(thinned, chosen, rtol=1e-6)
+
+
+@settings(max_examples=examples(20), deadline=None, derandomize=True)
+@given(seed=st.integers(0, 999), reach=st.sampled_from([0.002, 0.02, 0.2]), every=st.sampled_from([1, 3]))
+def test_where_only_the_best_pose_is_wanted_it_is_found_with_its_energy(seed: int, reach: float, every: int) -> None:
+    scene, t, rng = two_plates(), 10, np.random.default_rng(seed)
+    uv, p, motion = scene.some_pixels(1, 150), scene.pictures, scene.motion(1)
+    points, features = scene.points(uv), _costs.features_at(p.feature[0], uv.astype(np.float32))
+    R = motion.R[t] @ Rotation.from_rotvec(rng.normal(0, 3 * reach, (1, 30, 3)).reshape(-1, 3)).as_matrix()
+    poses = R[None], motion.t[t] + rng.normal(0, reach, (1, 30, 3))
+    base = rng.choice([0.0, 0.5, 10.0], (1, 30))
+    shown = p.depth[t], p.feature[t], p.K, every
+    none, all_of_them = (
+        _costs.energies(points[None], features[None], *poses, *shown, b, False) for b in (0 * base, base)
+    )
+    np.testing.assert_allclose(all_of_them[0], none[0] + base, rtol=1e-9)
+    energy, seen = _costs.energies(points[None], features[None], *poses, *shown, base, True)
+    best = all_of_them[0].argmin()
+    assert energy.argmin() == best
+    assert energy[0, best] == all_of_them[0][0, best]
+    assert seen[0, best] == all_of_them[1][0, best]
+    assert (energy >= energy[0, best]).all()
+    assert (energy <= all_of_them[0] + 1e-12).all()
+
+
+@settings(deadline=None)
+@given(hnp.arrays(np.float32, (5, 6), elements=st.sampled_from([0.0, 0.5, 0.75, 1.0, 3.0])))
+def test_what_is_around_all_pixels_is_what_is_around_each(depth: np.ndarray) -> None:
+    around = np.empty((2, 5, 6), np.float32)
+    _costs._extremes(depth, around)
+    there = np.where(depth > 0, depth, np.float32(99))
+    np.testing.assert_array_equal(around[0], cv2.erode(there, np.ones((3, 3), np.uint8)))
+    np.testing.assert_array_equal(around[1], cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+    for i, j in np.ndindex(5, 6):
+        _, nearest, farthest = _costs.nearest_reading(depth, float(j), float(i), 1.0)
+        assert (nearest, farthest) == (around[0, i, j], around[1, i, j])
+
+
+def test_many_points_cost_what_few_of_them_do() -> None:
+    """Of many, what is around a pixel is looked up."""
+    scene = two_plates()
+    grid, uv = segment_motion(scene.pictures), scene.pixels(1)
+    motions = [scene.motion(k) for k in range(3)] * (1 + scene.owner.size // len(uv) // 3)
+    assert len(motions) * len(uv) > scene.owner.size
+    many = motion_costs(scene.pictures, grid, motions, uv, scene.points(uv))
+    few = motion_costs(scene.pictures, grid, motions[:3], uv[:40], scene.points(uv[:40]))
+    np.testing.assert_array_equal(many[:3, :40], few)
+
+
+@settings(deadline=None, derandomize=True)
+@given(rotvec=st.lists(st.floats(-3, 3), min_size=3, max_size=3), flat=st.booleans())
+def test_a_surface_faces_the_camera_where_its_normal_does(rotvec: list[float], flat: bool) -> None:
+    rng = np.random.default_rng(0)
+    points, normals = rng.normal([0, 0, 1], 0.1, (40, 3)), rng.normal(size=(40, 3))
+    normals *= 0.0 if flat else 1 / np.linalg.norm(normals, axis=1, keepdims=True)
+    R, s = Rotation.from_rotvec(rotvec).as_matrix(), np.array([0.1, 0.0, 2.0])
+    toward_camera = -(points @ R.T + s)
+    cosine = (normals @ R.T * toward_camera).sum(1) / np.linalg.norm(toward_camera, axis=1)
+    clear = np.abs(cosine - 0.3) > 1e-9
+    np.testing.assert_array_equal(_costs.facing(points, normals, R, s, 0.3)[clear], ((cosine > 0.3) | flat)[clear])
 
 
 def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:
@@ -147,7 +210,7 @@ def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:
         uv = scene.some_pixels(k, 100)
         features = _costs.features_at(p.feature[0], uv.astype(np.float32))
         cost, moved, through = _costs.motion_costs(
-            scene.points(uv), features, frames, R, t, R[0], t[0], static, p.depth, p.feature, p.K
+            scene.points(uv), features, frames, np.zeros(3, int), R, t, R[0], t[0], static, p.depth, p.feature, p.K
         )
         assert (cost.argmin(0) == k).mean() > 0.9, k
         assert through[k].max() < 0.1
@@ -180,10 +243,15 @@ def test_the_cost_of_a_frame_is_that_of_all_of_them_in_the_mean() -> None:
     shown = scene.pictures.depth, scene.pictures.feature, scene.pictures.K
     still = scene.pictures.stillness
     static = grid.in_pixels(grid.static, scene.owner.shape)
-    cost, *_ = _costs.motion_costs(scene.points(uv), features, frames, R, t, still.R, still.t, static, *shown)
+    from_first = np.zeros(3, int)
+    of = scene.points(uv), features, frames, from_first, R, t, still.R, still.t, static
+    cost, *_ = _costs.motion_costs(*of, *shown)
     np.testing.assert_allclose(every[1:].mean(1), cost[1:].mean(1), atol=1e-5)
     # A covered point that rests costs more where it was last seen badly, which a single frame does not know.
     assert every[0].mean() <= cost[0].mean() + 1e-5
+    since = np.array([0, 7, FRAMES])
+    later = frame_costs(scene.pictures, grid, motions, uv, scene.points(uv), frames, since)
+    np.testing.assert_array_equal(later, np.where(frames > since[:, None], every, 0))
 
 
 def test_what_fits_leaves_no_residual_and_without_depth_none_is_known() -> None:

@@ -6,7 +6,7 @@ import moving_planes
 import numpy as np
 from rigid_body_scenes import Scene, scene, two_plates
 
-from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment
+from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, CellCosts
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, new_body, region_pixels
 from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies, refit
 from flowlab.tracking.trackers.rigid_bodies.merging import merge, neighbors
@@ -26,7 +26,7 @@ def fit_of(scene: Scene, owner: np.ndarray, motions: list[RigidMotion]) -> Rigid
     cost = np.ones((len(motions) + 1, *owner.shape), np.float32)
     for k in range(len(cost)):
         cost[k][owner == k] = 0
-    return RigidBodyFit(scene.pictures, grid, bodies, BodyAssignment(cost, cost))
+    return RigidBodyFit(CellCosts(scene.pictures, grid), bodies, BodyAssignment(cost, cost))
 
 
 def halves(scene: Scene) -> np.ndarray:
@@ -113,10 +113,10 @@ def test_a_body_that_won_cells_of_what_stands_still_keeps_its_motion() -> None:
     assert len(bodies) == 2  # as it is tracked by them, and as it was
     points = plates.points(plates.some_pixels(1, 50))
     truth = plates.motion(1).apply(points)
-    needed = RigidBodyFit.with_needed(plates.pictures, fit.grid, bodies)
+    needed = RigidBodyFit.with_needed(fit.cells, bodies)
     off = [np.linalg.norm(m.apply(points) - truth, axis=-1).max() for m in needed.motions]
     assert min(off) < 1e-9
-    fitted = replace(fit, pictures=replace(plates.pictures, still_is_fitted=True))
+    fitted = replace(fit, cells=CellCosts(replace(plates.pictures, still_is_fitted=True), fit.grid))
     assert len(refit(fitted, np.random.default_rng(0))) == 1
 
 

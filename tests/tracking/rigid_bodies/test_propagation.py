@@ -71,7 +71,7 @@ def test_points_that_leave_the_picture_are_not_seen() -> None:
     fit = fit_of(seen, away)
     cheap = np.zeros_like(fit.assignment.raw)
     cheap[0] = 9  # so that everything goes away
-    fit = RigidBodyFit(fit.pictures, fit.grid, fit.bodies, type(fit.assignment)(cheap, cheap))
+    fit = RigidBodyFit(fit.cells, fit.bodies, type(fit.assignment)(cheap, cheap))
     z = seen.pictures.depth[0, uv[:, 1], uv[:, 0]].astype(float)
     tracks = propagate(fit, uv.astype(float), z, not_followed(FRAMES, len(uv)))
     assert (tracks.motion == 1).all()

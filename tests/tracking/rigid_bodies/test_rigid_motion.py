@@ -1,4 +1,4 @@
-"""Rigid motions from points: Kabsch, robustly, and where points leave something open."""
+"""Rigid motions from points: least squares, robustly, and where points leave something open."""
 
 import numpy as np
 import pytest

@@ -19,7 +19,7 @@ _LOST, _GOOD = 0.4, 0.6
 """Energies above which a body is lost, and below which another may hold it."""
 _SHIFTS = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.0)
 _FAN_PX = np.array(sorted(((x, y, 0.0) for y in _SHIFTS for x in _SHIFTS), key=np.linalg.norm))
-"""Shifts in the picture [px] that a wider search tries, the least first: it is often the best, which spares the rest."""
+"""Shifts in the picture [px] that a wider search tries, the least first: often the best, which spares the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,14 +163,14 @@ def _by_flow(
     points = batch.points[hard, ::3]
     xyz = points @ last_R[hard].swapaxes(1, 2) + last_s[hard][:, None]
     target, ok = _carried_by_flow(batch.pictures, t, xyz)
-    R, s = fit_rigid(points, target, ok, 3, scale=0.004)
+    R, s = fit_rigid(points, target, ok.astype(float), 3, scale=0.004)
     few = ok.sum(1) < 6
     R[few], s[few] = best.R[hard[few]], best.s[hard[few]]
     return R, s
 
 
 def _carried_by_flow(pictures: ClipFeatures, t: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where optical flow takes points (B, n, 3) [m] of frame t - 1, and where that shows them and it can be believed."""
+    """Where optical flow takes points (B, n, 3) [m] of frame t - 1; and where that shows them and it is believed."""
     uv = pictures.project(xyz)
     j, i, ok = _pixels(pictures, uv)
     ok &= np.abs(pictures.depth[t - 1, i, j] - xyz[..., 2]) < 0.02
@@ -185,7 +185,7 @@ def _pixels(pictures: ClipFeatures, uv: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Columns and rows of the pixels nearest to some places (..., 2), and which of these are in the picture."""
     last = np.array(pictures.depth.shape[:0:-1]) - 1
     j, i = np.moveaxis(np.rint(np.minimum(np.maximum(uv, 0), last)).astype(int), -1, 0)
-    return j, i, (uv >= 0).all(-1) & (uv <= last).all(-1)
+    return j, i, np.asarray((uv >= 0).all(-1) & (uv <= last).all(-1))
 
 
 def _find_lost(batch: BodyBatch, t: int, best: _BestPoses, seen: LastSeen, lightness: np.ndarray) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from flowlab.tracking.trackers.rigid_bodies import _kabsch
+from flowlab.tracking.trackers.rigid_bodies import _absolute_orientation
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def fit_rigid(
     n = weight.shape[-1]
     points = (np.broadcast_to(x, (*batch, n, 3)).reshape(-1, n, 3).astype(float) for x in (a, b))
     flat = np.broadcast_to(weight, (*batch, n)).reshape(-1, n).astype(float)
-    R, t = _kabsch.fit_rigid(*points, flat, refinements, scale)
+    R, t = _absolute_orientation.fit_rigid(*points, flat, refinements, scale)
     return R.reshape(*batch, 3, 3), t.reshape(*batch, 3)
 
 

@@ -23,7 +23,7 @@ from flowlab.tracking.trackers.rigid_bodies.slippage import slippage
 _BELIEVED = 0.6
 """Confidence above which where a point was followed helps to tell its motion: what is thin is led astray at less."""
 COMPANION = ChunkSettings(stride=16)
-"""How its points are followed in the pictures: on 41 simulated films its own are as good as with twice as many chunks."""
+"""How points are followed in the pictures: on 41 films its own are as good as with twice as many chunks."""
 _MIN_FRAMES = 3
 """A shorter clip shows no motion to fit."""
 

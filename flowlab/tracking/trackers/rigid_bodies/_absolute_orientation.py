@@ -1,4 +1,4 @@
-"""The rigid motion that takes points onto others, compiled: by quaternions (Horn 1987), so that it is never a reflection."""
+"""The rigid motion that takes points onto others, compiled: by quaternions (Horn 1987), so never a reflection."""
 
 # mypy: ignore-errors
 import numba
@@ -80,8 +80,8 @@ def _rotation(H, R) -> None:
 
 @numba.njit(cache=True)
 def _sweep(N, V) -> int:
-    """Jacobi's rotations of a symmetric matrix (4, 4) by all its pairs, in place, and of its eigenvectors, the columns of
-    V; how many there were to make."""
+    """Jacobi's rotations of a symmetric matrix (4, 4) by all its pairs, in place, and of its eigenvectors, the columns
+    of V; how many there were to make."""
     made = 0
     for p in range(3):
         for q in range(p + 1, 4):
