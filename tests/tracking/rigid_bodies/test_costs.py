@@ -12,7 +12,7 @@ from rigid_body_scenes import FRAMES, two_plates
 from scipy.spatial.transform import Rotation
 from thoroughness import examples
 
-from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
+from flowlab.tracking.trackers.rigid_bodies import _costs, _energies, _readings, _surfaces
 from flowlab.tracking.trackers.rigid_bodies.assignment import frame_costs, looked_at, motion_costs
 from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
 from flowlab.tracking.trackers.rigid_bodies.recovery import LOST_ENERGY
@@ -64,7 +64,7 @@ def test_a_point_that_goes_through_shadow_is_not_taken_for_hidden_but_nothing_el
     features = _costs.features_at(pictures.feature[0], uv.astype(np.float32))
     pose = motion.R[None, None, t], motion.t[None, None, t]
     seen = pictures.depth[t], pictures.feature[t], pictures.K, 1, np.zeros((1, 1)), False
-    assert _costs.energies(scene.points(uv)[None], features[None], *pose, *seen)[0] > LOST_ENERGY
+    assert _energies.energies(scene.points(uv)[None], features[None], *pose, *seen)[0] > LOST_ENERGY
     path = motion.apply(scene.points(uv))
     residual = _costs.residuals(pictures.depth, pictures.feature, features, pictures.project(path), path[..., 2])
     assert np.median(residual[t]) > 0.6  # by which errors are stated: what is in shadow may be something else
@@ -97,11 +97,11 @@ def _lab(color: tuple) -> np.ndarray:
 def test_the_nearest_reading_is_that_of_the_layer_meant() -> None:
     depth = np.zeros((5, 5), np.float32)
     depth[1, 1], depth[2, 3], depth[3, 3] = 0.7, 0.9, 1.2
-    off, least, greatest = _costs.nearest_reading(depth, 2.0, 2.0, 1.25)
+    off, least, greatest = _readings.nearest_reading(depth, 2.0, 2.0, 1.25)
     assert (off, least, greatest) == pytest.approx((0.05, 0.7, 1.2))
     depth[2, 2] = 1.0
-    assert _costs.nearest_reading(depth, 2.2, 1.9, 0.97)[0] == pytest.approx(0.03)  # the center's own counts too
-    assert _costs.nearest_reading(np.zeros((5, 5), np.float32), 2.0, 2.0, 1.0)[2] == 0
+    assert _readings.nearest_reading(depth, 2.2, 1.9, 0.97)[0] == pytest.approx(0.03)  # the center's own counts too
+    assert _readings.nearest_reading(np.zeros((5, 5), np.float32), 2.0, 2.0, 1.0)[2] == 0
 
 
 def test_energy_is_least_where_the_body_is_and_tells_free_space_from_what_hides() -> None:
@@ -116,18 +116,18 @@ def test_energy_is_least_where_the_body_is_and_tells_free_space_from_what_hides(
 
     def energies(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         shown = p.depth[t], p.feature[t], p.K, 1, np.zeros((1, len(R))), False
-        energy, seen = _costs.energies(xyz[None], features[None], R[None], s[None], *shown)
+        energy, seen = _energies.energies(xyz[None], features[None], R[None], s[None], *shown)
         return energy[0], seen[0]
 
     energy, seen = energies(points)
     assert energy.argmin() == 0
     assert energy[0] < 0.25
     assert seen[0] > 0.95
-    assert energies(near)[0][0] == pytest.approx(_costs.SEEN_BEHIND), "the camera looks through where it would be"
-    assert energies(far)[0][0] == pytest.approx(_costs.HIDDEN), "the plate hides where it would be"
+    assert energies(near)[0][0] == pytest.approx(_energies.SEEN_BEHIND), "the camera looks through where it would be"
+    assert energies(far)[0][0] == pytest.approx(_energies.HIDDEN), "the plate hides where it would be"
     assert energies(near)[1][0] == energies(far)[1][0] == 0
     behind, _ = energies(points - [0, 0, 5.0])
-    np.testing.assert_allclose(behind, _costs.HIDDEN)
+    np.testing.assert_allclose(behind, _energies.HIDDEN)
 
 
 def test_every_nth_point_may_be_looked_at() -> None:
@@ -136,8 +136,8 @@ def test_every_nth_point_may_be_looked_at() -> None:
     points, p = scene.points(uv), scene.pictures
     features = _costs.features_at(p.feature[0], uv.astype(np.float32))
     R, s, shown = np.eye(3)[None, None], np.zeros((1, 1, 3)), (p.depth[t], p.feature[t], p.K)
-    thinned = _costs.energies(points[None], features[None], R, s, *shown, 3, np.zeros((1, 1)), False)
-    chosen = _costs.energies(points[None, ::3], features[None, ::3], R, s, *shown, 1, np.zeros((1, 1)), False)
+    thinned = _energies.energies(points[None], features[None], R, s, *shown, 3, np.zeros((1, 1)), False)
+    chosen = _energies.energies(points[None, ::3], features[None, ::3], R, s, *shown, 1, np.zeros((1, 1)), False)
     np.testing.assert_allclose(thinned, chosen, rtol=1e-6)
 
 
@@ -152,10 +152,10 @@ def test_where_only_the_best_pose_is_wanted_it_is_found_with_its_energy(seed: in
     base = rng.choice([0.0, 0.5, 10.0], (1, 30))
     shown = p.depth[t], p.feature[t], p.K, every
     none, all_of_them = (
-        _costs.energies(points[None], features[None], *poses, *shown, b, False) for b in (0 * base, base)
+        _energies.energies(points[None], features[None], *poses, *shown, b, False) for b in (0 * base, base)
     )
     np.testing.assert_allclose(all_of_them[0], none[0] + base, rtol=1e-9)
-    energy, seen = _costs.energies(points[None], features[None], *poses, *shown, base, True)
+    energy, seen = _energies.energies(points[None], features[None], *poses, *shown, base, True)
     best = all_of_them[0].argmin()
     assert energy.argmin() == best
     assert energy[0, best] == all_of_them[0][0, best]
@@ -168,12 +168,12 @@ def test_where_only_the_best_pose_is_wanted_it_is_found_with_its_energy(seed: in
 @given(hnp.arrays(np.float32, (5, 6), elements=st.sampled_from([0.0, 0.5, 0.75, 1.0, 3.0])))
 def test_what_is_around_all_pixels_is_what_is_around_each(depth: np.ndarray) -> None:
     around = np.empty((2, 5, 6), np.float32)
-    _costs._extremes(depth, around)
+    _readings.extremes(depth, around)
     there = np.where(depth > 0, depth, np.float32(99))
     np.testing.assert_array_equal(around[0], cv2.erode(there, np.ones((3, 3), np.uint8)))
     np.testing.assert_array_equal(around[1], cv2.dilate(depth, np.ones((3, 3), np.uint8)))
     for i, j in np.ndindex(5, 6):
-        _, nearest, farthest = _costs.nearest_reading(depth, float(j), float(i), 1.0)
+        _, nearest, farthest = _readings.nearest_reading(depth, float(j), float(i), 1.0)
         assert (nearest, farthest) == (around[0, i, j], around[1, i, j])
 
 
@@ -198,7 +198,7 @@ def test_a_surface_faces_the_camera_where_its_normal_does(rotvec: list[float], f
     toward_camera = -(points @ R.T + s)
     cosine = (normals @ R.T * toward_camera).sum(1) / np.linalg.norm(toward_camera, axis=1)
     clear = np.abs(cosine - 0.3) > 1e-9
-    np.testing.assert_array_equal(_costs.facing(points, normals, R, s, 0.3)[clear], ((cosine > 0.3) | flat)[clear])
+    np.testing.assert_array_equal(_energies.facing(points, normals, R, s, 0.3)[clear], ((cosine > 0.3) | flat)[clear])
 
 
 def test_a_motions_cost_is_least_for_the_points_that_follow_it() -> None:

@@ -7,6 +7,8 @@ Positions are meters in the camera frame; pixels have integer centers.
 import numba
 import numpy as np
 
+from flowlab.tracking.trackers.rigid_bodies._readings import extremes, extremes_at, nearest_of, nearest_reading
+
 SURFACE_TOLERANCE = 0.010
 """A depth this near a claimed surface [m, at up to 1 m; growing with the square of the distance] is that surface."""
 LCN, L, A, B = 0.25 * 3 / 255, 1 / 70, 1 / 30, 1 / 30
@@ -17,9 +19,6 @@ least share to which that lets a color fall, the cube root of an eighth of the l
 that is lost would rest in any shadow; nor residuals, by which stated errors were fitted."""
 BLACK, GRAY = 16 * 2.55, 128
 """In another light L + 16, a and b of CIE 1976 change by one factor; here, L is in 255ths, and a and b begin at 128."""
-SEEN_BEHIND, HIDDEN, HOLE = 2.5, 1.2, 0.6
-"""Cost of a body's point where the camera looks through it, where something is in front, and where depth is missing."""
-
 UNSEEN, AS_WELL, COVERED = 0.6, 0.05, 0.4
 """Cost of a moved point that is hidden: as much as where the picture shows, as well but for so much, what stood there
 before, and all that another color costs, for a finger may lie on it. And cost of a point that rests, beyond that at
@@ -71,72 +70,6 @@ def features_at(feature, uv) -> np.ndarray:
     return out
 
 
-@numba.njit(cache=True, fastmath=True)
-def energies(points, point_features, R, t, depth, feature, K, every, base, best) -> tuple[np.ndarray, np.ndarray]:
-    """How badly each body at each candidate pose explains a frame.
-
-    points (B, n, 3), point_features (B, n, 4), R (B, C, 3, 3), t (B, C, 3), base (B, C): what a pose costs in any
-    case; of the points each ``every``-th is looked at. Returns the mean energy (B, C) and the share of points seen in
-    place (B, C). With ``best``, only the least energy of each body is wanted: another pose is left once it is worse.
-    """
-    bodies, candidates = R.shape[:2]
-    height, width = depth.shape
-    n = points.shape[1]
-    energy = np.empty((bodies, candidates))
-    seen = np.empty((bodies, candidates))
-    count = (n + every - 1) // every
-    for b in range(bodies):
-        limit = np.inf
-        for c in range(candidates):
-            Q, s = R[b, c], t[b, c]
-            total, fits = base[b, c] * count, 0
-            for k in range(0, n, every):
-                if total > limit:
-                    break
-                p = points[b, k]
-                z = Q[2, 0] * p[0] + Q[2, 1] * p[1] + Q[2, 2] * p[2] + s[2]
-                if z <= 0.05:
-                    total += HIDDEN
-                    continue
-                near = 1 / z
-                u = (Q[0, 0] * p[0] + Q[0, 1] * p[1] + Q[0, 2] * p[2] + s[0]) * near * K[0, 0] + K[0, 2]
-                v = (Q[1, 0] * p[0] + Q[1, 1] * p[1] + Q[1, 2] * p[2] + s[1]) * near * K[1, 1] + K[1, 2]
-                if not (u > 0 and v > 0 and u < width - 1 and v < height - 1):
-                    total += HIDDEN
-                    continue
-                d = depth[int(v + 0.5), int(u + 0.5)]
-                if d == 0:
-                    total += HOLE + 0.7 * color_cost(feature, u, v, point_features[b, k])
-                    continue
-                off = abs(d - z) / (0.6 * tolerance(z))
-                if off < 2.5:
-                    total += color_cost(feature, u, v, point_features[b, k]) + 0.4 * off
-                    fits += 1
-                else:
-                    total += SEEN_BEHIND if d > z else HIDDEN
-            if best:
-                limit = min(limit, total)
-            energy[b, c] = total / count
-            seen[b, c] = fits / count
-    return energy, seen
-
-
-@numba.njit(cache=True)
-def facing(points, normals, R, t, grazing) -> np.ndarray:
-    """Which points (n, 3) with normals (n, 3) a pose turns to the camera, seen at an angle whose cosine is above
-    ``grazing``; one whose normal is 0 counts as if it did."""
-    out = np.empty(len(points), np.bool_)
-    x, m = np.empty(3), np.empty(3)
-    for k in range(len(points)):
-        for a in range(3):
-            x[a] = R[a, 0] * points[k, 0] + R[a, 1] * points[k, 1] + R[a, 2] * points[k, 2] + t[a]
-            m[a] = R[a, 0] * normals[k, 0] + R[a, 1] * normals[k, 1] + R[a, 2] * normals[k, 2]
-        toward = -(m[0] * x[0] + m[1] * x[1] + m[2] * x[2])
-        flat = normals[k, 0] == 0 and normals[k, 1] == 0 and normals[k, 2] == 0
-        out[k] = flat or toward > grazing * np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
-    return out
-
-
 @numba.njit(cache=True)
 def motion_costs(points, point_features, frames, since, R, t, still_R, still_t, static, depth, feature, K) -> tuple:
     """How badly each of B motions explains each of n frame-0 points, over some frames.
@@ -156,7 +89,7 @@ def motion_costs(points, point_features, frames, since, R, t, still_R, still_t, 
     around = np.empty((2, height, width) if dense else (2, 0, 0), np.float32)
     for f in frames:
         if dense:
-            _extremes(depth[f], around)
+            extremes(depth[f], around)
         for k in range(n):
             _carry(still_R[f], still_t[f], points[k], still[k])
         for b in range(bodies):
@@ -180,8 +113,8 @@ def motion_costs(points, point_features, frames, since, R, t, still_R, still_t, 
                 if dense:
                     nearest, farthest = around[0, i, j], around[1, i, j]
                 else:
-                    nearest, farthest = _extremes_at(depth[f], i, j)
-                off = _nearest(depth[f, i, j], nearest, farthest, z)
+                    nearest, farthest = extremes_at(depth[f], i, j)
+                off = nearest_of(depth[f, i, j], nearest, farthest, z)
                 if farthest == 0:
                     cost[b, k] += 0.35 + 0.5 * color_cost(feature[f], u, v, point_features[k], SHADED)
                 elif off < tolerance(z):
@@ -241,59 +174,6 @@ def _background_cost(x, R, t, static, depth, feature, f, u, v, K) -> float:
     if abs(depth[i, j] - z) > tolerance(z):
         return 2.0
     return color_cost(feature[f], u, v, feature[0, i, j], SHADED)
-
-
-@numba.njit(cache=True)
-def nearest_reading(depth, u, v, z) -> tuple[float, float, float]:
-    """Of the readings in the 3x3 pixels around (u, v): how near the closest comes to z (among the center's,
-    the least and the greatest), the least, and the greatest; 0 where there is none."""
-    height, width = depth.shape
-    i, j = min(max(int(v + 0.5), 0), height - 1), min(max(int(u + 0.5), 0), width - 1)
-    nearest, farthest = _extremes_at(depth, i, j)
-    return _nearest(depth[i, j], nearest, farthest, z), nearest, farthest
-
-
-@numba.njit(cache=True, inline="always")
-def _nearest(center, least, greatest, z) -> float:
-    """How near to z the closest of three readings comes, of which the first may be 0, for none."""
-    off = min(abs(least - z), abs(greatest - z))
-    return min(off, abs(center - z)) if center > 0 else off
-
-
-@numba.njit(cache=True, inline="always")
-def _extremes_at(depth, i, j) -> tuple[float, float]:
-    """The least and the greatest of the readings in the 3x3 pixels around one; 99 and 0 where there is none."""
-    height, width = depth.shape
-    nearest, farthest = 99.0, 0.0
-    for y in range(max(i - 1, 0), min(i + 2, height)):
-        for x in range(max(j - 1, 0), min(j + 2, width)):
-            d = depth[y, x]
-            if d > 0:
-                nearest, farthest = min(nearest, d), max(farthest, d)
-    return nearest, farthest
-
-
-@numba.njit(cache=True)
-def _extremes(depth, out) -> None:
-    """The least and the greatest of the readings in the 3x3 pixels around each (H, W), into ``out`` (2, H, W); 99 and
-    0 where there is none."""
-    height, width = depth.shape
-    least, most = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
-    for y in range(height + 1):
-        if y < height:
-            row = y % 3
-            for x in range(width):
-                least[row, x], most[row, x] = 99.0, 0.0
-                for k in range(max(x - 1, 0), min(x + 2, width)):
-                    d = depth[y, k]
-                    if d > 0:
-                        least[row, x], most[row, x] = min(least[row, x], d), max(most[row, x], d)
-        if y > 0:
-            for x in range(width):
-                low, high = least[(y - 1) % 3, x], most[(y - 1) % 3, x]
-                for other in range(max(y - 2, 0), min(y + 1, height)):
-                    low, high = min(low, least[other % 3, x]), max(high, most[other % 3, x])
-                out[0, y - 1, x], out[1, y - 1, x] = low, high
 
 
 @numba.njit(cache=True)

@@ -7,7 +7,8 @@ Positions are meters in the camera frame; pixels have integer centers.
 import numba
 import numpy as np
 
-from flowlab.tracking.trackers.rigid_bodies._costs import color_cost, nearest_reading, tolerance
+from flowlab.tracking.trackers.rigid_bodies._costs import color_cost, tolerance
+from flowlab.tracking.trackers.rigid_bodies._readings import nearest_reading
 
 _THROUGH = 1.2
 """What a point costs through whose place the camera looks."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from flowlab.tracking.trackers.rigid_bodies import _costs, _gauss_newton
+from flowlab.tracking.trackers.rigid_bodies import _costs, _energies, _gauss_newton
 from flowlab.tracking.trackers.rigid_bodies.features import ClipFeatures
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import nearest_rotation
 
@@ -41,7 +41,7 @@ class Surface:
 
     def facing(self, R: Float64[np.ndarray, "3 3"], s: Float64[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
         """Which points a pose turns to the camera; one whose normal is not known counts as if it did."""
-        return _costs.facing(self.points, self.normals, R, s, _GRAZING)
+        return _energies.facing(self.points, self.normals, R, s, _GRAZING)
 
 
 class BodyBatch:
@@ -100,7 +100,7 @@ class BodyBatch:
         self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice, every: int, base: np.ndarray, best: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         p, what = self.pictures, (self.points[of], self.features[of])
-        return _costs.energies(*what, R, s, p.depth[t], p.feature[t], p.K, every, base, best)
+        return _energies.energies(*what, R, s, p.depth[t], p.feature[t], p.K, every, base, best)
 
     def energies(
         self, t: int, R: np.ndarray, s: np.ndarray, of: np.ndarray | slice = slice(None), every: int = 1
