@@ -18,7 +18,13 @@ _ALWAYS = ("perception.point_cloud:unproject_and_crop", "geometry.sampling:_fart
 _OF_TRACKERS = {
     "rigid-bodies": tuple(
         f"tracking.trackers.rigid_bodies.{name}"
-        for name in ("_gauss_newton:align", "_surfaces:aggregate", "_costs:energies")
+        for name in (
+            "_absolute_orientation:fit_rigid",
+            "_costs:motion_costs",
+            "_energies:energies",
+            "_gauss_newton:align",
+            "_surfaces:aggregate",
+        )
     )
 }
 
