@@ -1,7 +1,7 @@
 """Which body a pixel belongs to: the one that best explains its depth and color over all frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, Num
@@ -109,14 +109,14 @@ def _compared(
     return (xyz_cam, features), (still.R, still.t, static, pictures.depth, pictures.feature, pictures.K)
 
 
-@dataclass(frozen=True, slots=True)
 class CellCosts:
     """What motions cost the cells of a clip's first frame whose motion is undecided; each is computed once."""
 
-    pictures: ClipFeatures
-    grid: MotionGrid
-    _known: dict[int, tuple[RigidMotion, Float32[np.ndarray, "n"]]] = field(default_factory=dict)
-    """By the identity of the motion."""
+    def __init__(self, pictures: ClipFeatures, grid: MotionGrid) -> None:
+        self.pictures = pictures
+        self.grid = grid
+        self.stillness = pictures.stillness
+        self._known: dict[int, tuple[RigidMotion, np.ndarray]] = {}  # by the identity of the motion
 
     def of(self, motions: Sequence[RigidMotion]) -> Float32[np.ndarray, "B n"]:
         """The cost of each motion, see :func:`motion_costs`."""
@@ -130,11 +130,11 @@ class CellCosts:
 
 def assign(cells: CellCosts, motions: Sequence[RigidMotion]) -> BodyAssignment:
     """Costs of stillness and of some motions, in all cells whose motion is undecided."""
-    pictures, grid, every = cells.pictures, cells.grid, [cells.pictures.stillness, *motions]
+    grid, every = cells.grid, [cells.stillness, *motions]
     raw = np.full((len(every), *grid.valid.shape), _UNKNOWN_COST, np.float32)
     raw[0] = 0
     raw[:, grid.undecided] = cells.of(every)
-    feature = pictures.feature[0, ::STEP, ::STEP]
+    feature = cells.pictures.feature[0, ::STEP, ::STEP]
     cost = _surfaces.aggregate(
         raw, grid.undecided, grid.valid, grid.depth, feature, _REACH, _DEPTH_SCALE, _COLOR_SCALE, _SPACE_SCALE
     )
