@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigid_body_scenes import fit_of, two_plates
+from scipy.spatial.transform import Rotation
 from thoroughness import examples
 
 from flowlab.records import Clip, PositionSource, Tracks2D, Tracks3D
@@ -16,6 +18,8 @@ from flowlab.tracking.chunking import ChunkSettings
 from flowlab.tracking.labeling import label_clip
 from flowlab.tracking.lifting import LiftSettings
 from flowlab.tracking.trackers.rigid_bodies import RigidBodies, doubt
+from flowlab.tracking.trackers.rigid_bodies.choice import FollowedPoints
+from flowlab.tracking.trackers.rigid_bodies.propagation import propagate
 
 FRAMES, SWAPPED = 16, 7
 WALL = np.stack(np.meshgrid(np.arange(12, 60, 8), np.arange(12, 110, 12)), -1).reshape(-1, 2).astype(np.float32)
@@ -93,6 +97,26 @@ def test_what_could_have_slid_far_unseen_states_half_of_that() -> None:
     evidence = np.zeros((1, len(doubt.EVIDENCE)))
     evidence[0, list(doubt.EVIDENCE).index("slippage")] = 0.9
     assert doubt.stated_error(evidence, np.ones(1))[0] >= 0.45
+
+
+def test_how_far_bodies_turn_and_what_they_gain_is_evidence() -> None:
+    seen = two_plates()
+    fit, uv = fit_of(seen, seen.motion(1), seen.motion(2)), seen.some_pixels(1, 20)
+    angle = np.stack([Rotation.from_matrix(m.R).magnitude() for m in fit.motions], 1)
+    np.testing.assert_allclose(doubt._turned(fit), angle, atol=1e-6)
+    gain, owner, cost = doubt._gain(fit), fit.assignment.best_motion, fit.assignment.cost
+    without = np.sort(cost[:, owner == 2], 0)
+    assert gain[2] == pytest.approx((without[1] - without[0]).mean(), rel=1e-5)
+    assert gain[1:].min() > 0.1
+    assert doubt._gain(fit_of(seen)) == pytest.approx([0.0])  # nothing else explains anything
+    followed = FollowedPoints(seen.motion(1).apply(seen.points(uv)), np.ones((len(angle), 20), bool))
+    carried = propagate(fit, uv.astype(float), seen.points(uv)[:, 2], followed)
+    of = carried, uv.astype(float), seen.points(uv)[:, 2], carried.visible, followed.xyz_cam, np.zeros(20)
+    evidence = dict(zip(doubt.EVIDENCE, np.moveaxis(doubt.evidence(fit, *of), -1, 0), strict=True))
+    assert (carried.motion == 1).all()
+    np.testing.assert_allclose(evidence["turned"], angle[:, [1]].repeat(20, 1), atol=1e-6)
+    np.testing.assert_allclose(evidence["cost"][5], carried.cost)
+    np.testing.assert_allclose(evidence["gain"], gain[1])
 
 
 def test_what_left_the_picture_says_nothing_for_or_against_what_is_around() -> None:
