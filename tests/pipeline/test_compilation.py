@@ -41,9 +41,8 @@ def test_the_kernels_that_are_asked_for_are_there(tracker: str) -> None:
     assert all(isinstance(kernel, numba.core.registry.CPUDispatcher) for kernel in kernels)
     asked = {Path(kernel.py_func.__code__.co_filename) for kernel in kernels}
     compiled = {f for f in Path(rigid_bodies.__file__).parent.glob("_*.py") if "@numba.njit" in f.read_text("utf-8")}
-    not_always = {
-        f for f in compiled if f.stem in ("_readings", "_slipping")
-    }  # within others, and where things may slip
+    # One is within others, the other is called where things may slip.
+    not_always = {f for f in compiled if f.stem in ("_readings", "_slipping")}
     assert asked & compiled == (compiled - not_always if tracker == "rigid-bodies" else set())
     assert len(asked - compiled) == 3
 

@@ -43,6 +43,11 @@ class BodyAssignment:
         """The best motion of every cell, -1 where there is no depth."""
         return np.where(np.isfinite(self.cost[0]), self.cost.argmin(0), -1)
 
+    @property
+    def gain(self) -> Float64[np.ndarray, "B"]:
+        """How much more the cells of each motion would cost with the next best one, in the mean; 0 if there is none."""
+        return _gains(self.cost)[0] if len(self.cost) > 1 else np.zeros(1)
+
     def select(self, motions: Sequence[int]) -> "BodyAssignment":
         """The same with some of the motions only."""
         return BodyAssignment(self.raw[list(motions)], self.cost[list(motions)])
@@ -158,6 +163,16 @@ def _decide_by_surroundings(raw: np.ndarray, cost: np.ndarray, grid: MotionGrid,
     cost[:, open_to_doubt] = raw[:, open_to_doubt] = settled[:, open_to_doubt]
 
 
+def _gains(cost: Float32[np.ndarray, "B h w"]) -> tuple[Float64[np.ndarray, "B"], Int64[np.ndarray, "B"]]:
+    """How much more the cells of each of two or more motions would cost with the next best one, in the mean, and how
+    many these are, at least 1."""
+    found = cost[:, np.isfinite(cost[0])]
+    best, second = np.partition(found, 1, axis=0)[:2]
+    owner = found.argmin(0)
+    cells = np.bincount(owner, minlength=len(cost)).clip(1)
+    return np.bincount(owner, second - best, len(cost)) / cells, cells
+
+
 def select_needed(assignment: BodyAssignment, many_tell_more: bool = True) -> list[int]:
     """The motions worth having: dropped, one by one, is what costs its cells little to do without.
 
@@ -170,12 +185,7 @@ def select_needed(assignment: BodyAssignment, many_tell_more: bool = True) -> li
     """
     kept = list(range(len(assignment.cost)))
     while len(kept) > 2:
-        cost = assignment.cost[kept]
-        valid = np.isfinite(cost[0])
-        best, second = np.partition(cost[:, valid], 1, axis=0)[:2]
-        owner, gain = cost[:, valid].argmin(0), second - best
-        cells = np.bincount(owner, minlength=len(kept))[1:].clip(1)
-        worth = np.bincount(owner, gain, len(kept))[1:] / cells
+        worth, cells = (x[1:] for x in _gains(assignment.cost[kept]))
         needed = np.clip(1 / np.sqrt(cells), *_NEEDED) if many_tell_more else np.full(len(cells), _NEEDED[1])
         least = int(np.argmin(worth / needed))
         if worth[least] > needed[least]:

@@ -7,6 +7,7 @@ from importlib.resources import files
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from flowlab.tracking.error_model import ErrorModel
 from flowlab.tracking.trackers.rigid_bodies import _costs, _surfaces
@@ -119,7 +120,7 @@ def evidence(
         cells.out_of_view[:, around].mean(-1),
         _turned(fit)[:, carried.motion],
         carried.cost,
-        _gain(fit)[carried.motion],
+        fit.assignment.gain[carried.motion],
     )
     return np.stack([np.broadcast_to(c, seen.shape) for c in columns], -1).astype(np.float64)
 
@@ -154,20 +155,8 @@ def _fastest(fit: RigidBodyFit) -> Float64[np.ndarray, "T B"]:
 
 def _turned(fit: RigidBodyFit) -> Float64[np.ndarray, "T B"]:
     """The angle [rad] by which each body is turned, before what stands still."""
-    turns = [m.R @ fit.motions[0].R.swapaxes(1, 2) for m in fit.motions]
-    return np.stack([np.arccos(((np.trace(R, axis1=1, axis2=2) - 1) / 2).clip(-1, 1)) for R in turns], 1)
-
-
-def _gain(fit: RigidBodyFit) -> Float64[np.ndarray, "B"]:
-    """How much more the cells of each motion would cost with the next best one, in the mean; 0 if there is none."""
-    owner, cost = fit.assignment.best_motion, fit.assignment.cost
-    gain = np.zeros(len(cost))
-    for k in range(len(cost)):
-        cells = owner == k
-        if len(cost) > 1 and cells.any():
-            best, second = np.partition(cost[:, cells], 1, axis=0)[:2]
-            gain[k] = (second - best).mean()
-    return gain
+    back = fit.motions[0].R.swapaxes(1, 2)
+    return np.stack([Rotation.from_matrix(m.R @ back).magnitude() for m in fit.motions], 1)
 
 
 def _frames_hidden(seen: Bool[np.ndarray, "T M"]) -> Float64[np.ndarray, "T M"]:
