@@ -64,6 +64,14 @@ class Demonstration(Record, ABC):
             Depth [m], and color and owners where they are known.
         """
 
+    def changed(self) -> str:
+        """What has changed, since it was opened, of the files that it is read from.
+
+        Returns:
+            What that is, in words; empty where nothing has, and where there are none.
+        """
+        return ""
+
 
 @dataclass(frozen=True, slots=True, repr=False)
 class ObservedDemo(Record):

@@ -26,6 +26,7 @@ from flowlab.recordings.folder_files import entries
 from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.frame_check import FrameCheck
 from flowlab.recordings.frame_processing import FrameProcessor
+from flowlab.recordings.identity import difference, identity
 from flowlab.recordings.parsing import (
     AlignedSamples,
     ParsedRecording,
@@ -62,6 +63,10 @@ class Recording(Demonstration):
     streams: Streams
     processor: FrameProcessor
     frame_check: FrameCheck
+    settings: RecordingSettings
+    """How it is read."""
+    content: str = ""
+    """What it was known by when it was opened (:func:`~flowlab.recordings.identity.identity`), where that was asked."""
 
     def frame(self, t: int) -> Frame:
         """Decode the pictures of row t: depth float32 [m] seen from the color camera, and color."""
@@ -71,6 +76,10 @@ class Recording(Demonstration):
         except BadImage as error:
             raise DataError(f"{self.path}: row {t} could be read when it was opened, and now it {error}") from error
         return Frame(self.processor.depth(counts), self.camera_at(t), rgb=self.processor.color(rgb))
+
+    def changed(self) -> str:
+        """What of the recording has changed since it was opened, in words; empty where nothing has."""
+        return difference(self.content, identity(self.path, self.settings)) if self.content else ""
 
 
 def find_recordings(
@@ -162,6 +171,7 @@ def open_recording(path: Path, settings: RecordingSettings, *, task: str, seed: 
         streams=source.streams,
         processor=processor,
         frame_check=source.frame_check,
+        settings=settings,
     )
     if processor.registration is not None and not recording.frame(0).depth.any():
         raise DataError(

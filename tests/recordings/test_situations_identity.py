@@ -4,6 +4,7 @@ import json
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,9 @@ import pytest
 from synthetic import call_cli
 from synthetic_clip import record
 
+from flowlab.pipeline.stage import EpisodeRequest, Rejected
+from flowlab.pipeline.stages.observe import ObserverStage
+from flowlab.pipeline.stages.recording import RecordingStage
 from flowlab.recordings.identity import difference, identity
 from flowlab.recordings.recording import RecordingSettings
 from flowlab.storage.dataset import Dataset
@@ -113,6 +117,29 @@ def test_a_recording_that_is_being_copied_is_told_and_tried_again(tmp_path: Path
     for name in ("color", "depth"):
         shutil.copytree(whole / name, take / name, dirs_exist_ok=True)
     assert [len(e) for e in label(capsys, take, "--out", out).episodes()] == [8]
+
+
+def overwrite_by_another(picture: Path) -> None:
+    shutil.copy(picture.with_name("000003.png"), picture)
+
+
+def cut_in_half(picture: Path) -> None:
+    picture.write_bytes(picture.read_bytes()[:100])
+
+
+@pytest.mark.parametrize("spoil", [overwrite_by_another, cut_in_half, Path.unlink])
+@pytest.mark.parametrize("stream", ["color", "depth"])
+def test_a_picture_that_changes_after_the_recording_was_opened_is_not_labeled(
+    tmp_path: Path, stream: str, spoil: Callable[[Path], None]
+) -> None:
+    take = record(tmp_path / "pour/0", frames=5)
+    opened = RecordingStage().process(EpisodeRequest(task="pour", seed=0, source=str(take)))
+    look = ObserverStage(points=64, crop={"low": (-1, -1, 0.15), "high": (1, 1, 1.5)})
+    assert len(look.process(opened).points_world) == 5  # the control
+    spoil(take / stream / "000001.png")
+    with pytest.raises(Rejected, match="its files changed while it was read, so it is still being written") as told:
+        look.process(opened)
+    assert told.value.retry
 
 
 def test_one_of_the_same_name_is_a_new_recording_and_one_that_moved_is_not(tmp_path: Path, capsys: Capture) -> None:

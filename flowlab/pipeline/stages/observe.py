@@ -1,5 +1,8 @@
 """The stages that see: the clouds of every frame, and the query points on the first."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +23,12 @@ class ObserverStage(Stage, ObserverSettings):
     stage: str = "observer"
 
     def process(self, record: Demonstration) -> ObservedDemo:
-        """Unproject, crop and sample every frame."""
+        """Unproject, crop and sample every frame. Pictures are read for the last time, so what they are read from must
+        be as it was when it was opened."""
+        with read_as_a_whole(record.extras.get("source", record.task), record.changed):
+            return self._observe(record)
+
+    def _observe(self, record: Demonstration) -> ObservedDemo:
         observer = Observer(self, record.task)
         first = _frame(record, 0)
         steps, shape = len(record), first.depth.shape
@@ -45,6 +53,36 @@ class ObserverStage(Stage, ObserverSettings):
     def describe(self, provenance: Provenance, task: str) -> Provenance:
         """How the clouds were made, so that a policy's are made the same way."""
         return provenance.model_copy(update={"observer": _settings(self, ObserverSettings)})
+
+
+@contextmanager
+def read_as_a_whole(source: Path | str, changed: Callable[[], str]) -> Iterator[None]:
+    """What is read of files that change meanwhile is rejected, be it well or badly read, to be tried again.
+
+    Args:
+        source: What is read.
+        changed: Tells what of it has changed, in words; nothing where nothing has.
+
+    Raises:
+        Rejected: It has changed, or is not there any more.
+    """
+    fault = None
+    try:
+        yield
+    except (DataError, Rejected) as error:  # of a file that is half there, perhaps
+        fault = error
+    try:
+        found = changed()
+    except DataError as error:
+        raise Rejected(str(error), retry=True) from error
+    if found:
+        raise Rejected(
+            f"{source}: {found} changed while it was read, so it is still being written; run the same command "
+            "again when it is complete",
+            retry=True,
+        ) from fault
+    if fault is not None:
+        raise fault
 
 
 def _frame(demo: Demonstration, t: int) -> Frame:

@@ -14,7 +14,7 @@ from flowlab.errors import DataError
 from flowlab.geometry.camera import Camera
 from flowlab.pipeline.stage import EpisodeRequest, Rejected, Stage
 from flowlab.pipeline.stages.labeled import labeled
-from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage
+from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage, read_as_a_whole
 from flowlab.pipeline.stages.quality import QualityStage
 from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
@@ -50,26 +50,15 @@ class RecordingStage(Stage, RecordingSettings):
 
     def process(self, record: EpisodeRequest) -> Recording:
         """Open the recording that the request names."""
-        path, fault = Path(record.source), None
+        path = Path(record.source)
         try:
             wait_until_quiet(path)
             content = identity(path, self)
-            try:
+            with read_as_a_whole(path, lambda: difference(content, identity(path, self))):
                 recording = open_recording(path, self, task=record.task, seed=record.seed)
-            except DataError as error:  # of a file that is half there, perhaps
-                fault = error
-            changed = difference(content, identity(path, self))
         except DataError as error:
             raise Rejected(str(error), retry=True) from error
-        if changed:
-            raise Rejected(
-                f"{path}: {changed} changed while it was read, so it is still being written; run the same command "
-                "again when it is complete",
-                retry=True,
-            )
-        if fault is not None:
-            raise Rejected(str(fault), retry=True) from fault
-        return replace(recording, extras={**recording.extras, CONTENT: content})
+        return replace(recording, content=content, extras={**recording.extras, CONTENT: content})
 
     def describe(self, provenance: Provenance, task: str) -> Provenance:
         """Recorded, each in a world frame of its own; what the numbers of state and action mean is not known."""
