@@ -8,9 +8,9 @@ from rigid_body_scenes import Scene, scene, two_plates
 
 from flowlab.tracking.trackers.rigid_bodies.assignment import BodyAssignment, CellCosts
 from flowlab.tracking.trackers.rigid_bodies.bodies import RigidBodyFit, new_body, region_pixels
-from flowlab.tracking.trackers.rigid_bodies.fit import refit
+from flowlab.tracking.trackers.rigid_bodies.fit import fit_bodies, refit
 from flowlab.tracking.trackers.rigid_bodies.merging import merge, neighbors
-from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import segment_motion
+from flowlab.tracking.trackers.rigid_bodies.motion_segmentation import MotionGrid, segment_motion
 from flowlab.tracking.trackers.rigid_bodies.pose_tracking import RigidBody
 from flowlab.tracking.trackers.rigid_bodies.rigid_motion import RigidMotion
 
@@ -118,3 +118,20 @@ def test_a_body_that_won_cells_of_what_stands_still_keeps_its_motion() -> None:
     assert min(off) < 1e-9
     fitted = replace(fit, cells=CellCosts(replace(plates.pictures, still_is_fitted=True), fit.grid))
     assert len(refit(fitted, np.random.default_rng(0))) == 1
+
+
+def test_the_whole_fit_finds_the_plates_and_which_cells_are_theirs() -> None:
+    plates = two_plates(0.002)
+    fit = fit_bodies(plates.pictures, seed=0)
+    assert len(fit.motions) == len(fit.bodies) + 1
+    best = fit.assignment.best_motion
+    for k in (1, 2):
+        inner = plates.some_pixels(k, 80)
+        cells = best[inner[:, 1] // 2, inner[:, 0] // 2]
+        mine = int(np.bincount(cells).argmax())
+        assert mine > 0
+        assert (cells == mine).mean() > 0.9, k
+        points = plates.points(inner)
+        off = np.linalg.norm(fit.motions[mine].apply(points) - plates.motion(k).apply(points), axis=-1)
+        assert np.median(off, 1).max() < 0.006, k
+    assert isinstance(fit.grid, MotionGrid)

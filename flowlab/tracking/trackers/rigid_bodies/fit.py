@@ -22,31 +22,19 @@ _UNEXPLAINED = 0.42
 """Cost above which no body explains a cell that moved."""
 
 
-def fit_bodies(pictures: ClipFeatures, seed: int, restarts: int = 0) -> RigidBodyFit:
+def fit_bodies(pictures: ClipFeatures, seed: int) -> RigidBodyFit:
     """Find the rigid bodies of a clip, their motions and which pixels are theirs.
 
     Args:
         pictures: The clip, of three frames at least.
         seed: Of the random choices; the same seed gives the same fit.
-        restarts: How many more times bodies are searched for, with other random choices; of all that are found, those
-            are kept that explain what the others do not.
     """
     rng = np.random.default_rng(seed)
     pictures, grid = with_camera_motion(pictures, segment_motion(pictures), rng)
-    cells = CellCosts(pictures, grid)
-    fit = _search(cells, rng)
-    if restarts:
-        others = [_search(cells, other) for other in rng.spawn(restarts)]
-        fit = _settled(cells, [body for found in (fit, *others) for body in found.bodies], rng)
-    return fit
-
-
-def _search(cells: CellCosts, rng: np.random.Generator) -> RigidBodyFit:
-    """Propose bodies, track them, and look for what they leave unexplained."""
-    pictures, grid = cells.pictures, cells.grid
     seeds = track_seeds(pictures, grid.pixels(grid.valid & ~grid.static & ~grid.edge), rng)
     proposed = [RigidBody(p.pixels, p.motion, p.known) for p in propose_motions(seeds, _MAX_PROPOSALS, rng)]
     bodies = track_poses(pictures, [*_small_moved_bodies(pictures, grid), *proposed], rng)
+    cells = CellCosts(pictures, grid)
     for k in range(_ROUNDS):
         fit = RigidBodyFit.with_needed(cells, bodies)
         bodies = refit(fit, rng)
@@ -54,11 +42,6 @@ def _search(cells: CellCosts, rng: np.random.Generator) -> RigidBodyFit:
             room = max(_MAX_BODIES - len(fit.bodies), 0)
             bodies += track_poses(pictures, _bodies_of_unexplained(cells, bodies, room), rng)
             bodies += _taken_along(cells, bodies, rng)
-    return _settled(cells, bodies, rng)
-
-
-def _settled(cells: CellCosts, bodies: list[RigidBody], rng: np.random.Generator) -> RigidBodyFit:
-    """The fit by what is needed of some bodies, those that one motion explains merged."""
     fit = RigidBodyFit.with_needed(cells, bodies)
     for _ in range(_MERGE_ROUNDS):
         merged = merge(fit, rng)

@@ -46,9 +46,6 @@ class RigidBodies(Tracker):
     """Mean cost above which a motion does not explain a point."""
     seed: int = 0
     """Of the random choices; the same seed gives the same tracks."""
-    restarts: int = Field(default=0, ge=0, le=9)
-    """How many more times bodies are searched for, with other random choices; what all searches find is judged
-    together. Each takes two thirds of the time of a fit without."""
 
     def open(self, clip: Clip) -> "RigidBodiesSession":
         """Get ready to track points of a clip; the fit is made when it is known from which frame on."""
@@ -115,7 +112,7 @@ def fit_points(
     if len(clip) < _MIN_FRAMES or len(deep) == 0 or not large_enough(clip):
         return None
     pictures = extract_features(clip, options.max_depth)
-    fit, uv = fit_bodies(pictures, options.seed, options.restarts), pictures.from_clip_pixels(xy[deep])
+    fit, uv = fit_bodies(pictures, options.seed), pictures.from_clip_pixels(xy[deep])
     if not fit.grid.valid.any():
         return None
     beside = _lifted(clip, followed, deep)
