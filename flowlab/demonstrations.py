@@ -68,7 +68,7 @@ class Demonstration(Record, ABC):
         """What has changed, since it was opened, of the files that it is read from.
 
         Returns:
-            What that is, in words; empty where nothing has, and where there are none.
+            What that is, after their path; empty where nothing has, and where there are none.
         """
         return ""
 

@@ -63,6 +63,16 @@ def difference(old: str, new: str) -> str:
     return " and ".join(parts)
 
 
+def changed_since(content: str, path: Path, settings: RecordingSettings) -> str:
+    """What of a recording has changed since it was known by ``content``, after its path; empty where nothing has.
+
+    Raises:
+        DataError: A file of it cannot be read.
+    """
+    what = difference(content, identity(path, settings))
+    return f"{path}: {what}" if what else ""
+
+
 def wait_until_quiet(path: Path) -> None:
     """Return when nothing has been written into a recording for a while, or when it is clear that this lasts.
 

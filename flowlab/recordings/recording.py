@@ -26,7 +26,7 @@ from flowlab.recordings.folder_files import entries
 from flowlab.recordings.foreign import foreign_format
 from flowlab.recordings.frame_check import FrameCheck
 from flowlab.recordings.frame_processing import FrameProcessor
-from flowlab.recordings.identity import difference, identity
+from flowlab.recordings.identity import changed_since
 from flowlab.recordings.parsing import (
     AlignedSamples,
     ParsedRecording,
@@ -78,8 +78,8 @@ class Recording(Demonstration):
         return Frame(self.processor.depth(counts), self.camera_at(t), rgb=self.processor.color(rgb))
 
     def changed(self) -> str:
-        """What of the recording has changed since it was opened, in words; empty where nothing has."""
-        return difference(self.content, identity(self.path, self.settings)) if self.content else ""
+        """What of the recording has changed since it was opened, after its path; empty where nothing has."""
+        return changed_since(self.content, self.path, self.settings) if self.content else ""
 
 
 def find_recordings(

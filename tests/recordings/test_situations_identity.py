@@ -140,6 +140,7 @@ def test_a_picture_that_changes_after_the_recording_was_opened_is_not_labeled(
     with pytest.raises(Rejected, match="its files changed while it was read, so it is still being written") as told:
         look.process(opened)
     assert told.value.retry
+    assert told.value.reason.startswith(f"{take}: ")
 
 
 def test_one_of_the_same_name_is_a_new_recording_and_one_that_moved_is_not(tmp_path: Path, capsys: Capture) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ class ObserverStage(Stage, ObserverSettings):
     def process(self, record: Demonstration) -> ObservedDemo:
         """Unproject, crop and sample every frame. Pictures are read for the last time, so what they are read from must
         be as it was when it was opened."""
-        with read_as_a_whole(record.extras.get("source", record.task), record.changed):
+        with read_as_a_whole(record.changed):
             return self._observe(record)
 
     def _observe(self, record: Demonstration) -> ObservedDemo:
@@ -56,12 +55,11 @@ class ObserverStage(Stage, ObserverSettings):
 
 
 @contextmanager
-def read_as_a_whole(source: Path | str, changed: Callable[[], str]) -> Iterator[None]:
+def read_as_a_whole(changed: Callable[[], str]) -> Iterator[None]:
     """What is read of files that change meanwhile is rejected, be it well or badly read, to be tried again.
 
     Args:
-        source: What is read.
-        changed: Tells what of it has changed, in words; nothing where nothing has.
+        changed: Tells what has changed of what is read, after its path; nothing where nothing has.
 
     Raises:
         Rejected: It has changed, or is not there any more.
@@ -77,7 +75,7 @@ def read_as_a_whole(source: Path | str, changed: Callable[[], str]) -> Iterator[
         raise Rejected(str(error), retry=True) from error
     if found:
         raise Rejected(
-            f"{source}: {found} changed while it was read, so it is still being written; run the same command "
+            f"{found} changed while it was read, so it is still being written; run the same command "
             "again when it is complete",
             retry=True,
         ) from fault

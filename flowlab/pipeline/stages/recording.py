@@ -18,7 +18,7 @@ from flowlab.pipeline.stages.observe import ObserverStage, QueriesStage, read_as
 from flowlab.pipeline.stages.quality import QualityStage
 from flowlab.pipeline.stages.write import WriteStage
 from flowlab.provenance import Provenance
-from flowlab.recordings.identity import difference, identity, wait_until_quiet
+from flowlab.recordings.identity import changed_since, identity, wait_until_quiet
 from flowlab.recordings.recording import Recording, RecordingSettings, open_recording
 from flowlab.records import Clip, Episode, Queries
 from flowlab.storage.recorded import CONTENT
@@ -54,7 +54,7 @@ class RecordingStage(Stage, RecordingSettings):
         try:
             wait_until_quiet(path)
             content = identity(path, self)
-            with read_as_a_whole(path, lambda: difference(content, identity(path, self))):
+            with read_as_a_whole(lambda: changed_since(content, path, self)):
                 recording = open_recording(path, self, task=record.task, seed=record.seed)
         except DataError as error:
             raise Rejected(str(error), retry=True) from error
