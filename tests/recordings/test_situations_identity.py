@@ -123,11 +123,11 @@ def overwrite_by_another(picture: Path) -> None:
     shutil.copy(picture.with_name("000003.png"), picture)
 
 
-def cut_in_half(picture: Path) -> None:
+def cut_short(picture: Path) -> None:
     picture.write_bytes(picture.read_bytes()[:100])
 
 
-@pytest.mark.parametrize("spoil", [overwrite_by_another, cut_in_half, Path.unlink])
+@pytest.mark.parametrize("spoil", [overwrite_by_another, cut_short, Path.unlink])
 @pytest.mark.parametrize("stream", ["color", "depth"])
 def test_a_picture_that_changes_after_the_recording_was_opened_is_not_labeled(
     tmp_path: Path, stream: str, spoil: Callable[[Path], None]
